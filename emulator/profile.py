@@ -186,16 +186,6 @@ PATHS: Final = frozenset(
 )
 """Keys of files and folders, which refer to the folder of the profile that has them."""
 
-LINK_PARAMETERS: Final[dict[str, str]] = {
-    "serial_dialect": "links.serial.dialect",
-    "serial_baud": "links.serial.baud",
-    "can_address": "links.can.address",
-    "host_address": "links.can.host_address",
-    "canopen_node": "links.canopen.node",
-}
-"""Device parameters whose defaults are set under another key of a profile."""
-
-
 _A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
 OF_FAULTS: Final = dict.fromkeys(
     ("fault", "faults", "optical", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
@@ -203,6 +193,10 @@ OF_FAULTS: Final = dict.fromkeys(
     _A_FAULT,
 )  # fmt: skip
 """Keys of faults, which a profile does not have, and the hint for whoever writes one there."""
+OF_ATTITUDES: Final = {
+    key: f"; did you mean attitude.{key}?" for key in ("ra_deg", "dec_deg", "roll_deg", "quaternion_xyzw")
+}
+"""Keys of an attitude, and the hint for whoever writes one outside its table."""
 
 
 def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> Profile:
@@ -225,7 +219,7 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
-        listed = problems(error, Profile, values, also=("extends",), hints=OF_FAULTS)
+        listed = problems(error, Profile, values, also=("extends",), hints=OF_FAULTS | OF_ATTITUDES)
         found += [(problem.location, str(problem)) for problem in listed]
     name = str(values.get("unit", DEFAULT_UNIT))
     unit = _path_of_unit(name, path.parent)
@@ -289,10 +283,10 @@ def _problems_of_keys(
 
 def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) -> None:
     for name, value in table.items():
-        if name in LINK_PARAMETERS:
-            raise EmulatorError(f"parameters.{name}: set {LINK_PARAMETERS[name]} instead")
         if name not in known:
             raise EmulatorError(f"parameters.{name}: unknown key{remedy(name, known)}")
+        if known[name].profile_key:
+            raise EmulatorError(f"parameters.{name}: set {known[name].profile_key} instead")
         try:
             known[name].check(value)
         except ProtocolError as error:

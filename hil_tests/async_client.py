@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError, NoReplyError
-from starhil.hil_tests.images import Image, download_by_bursts, download_by_frames
 from starhil.hil_tests.links import HostLink
 from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.protocol.codec import Row
@@ -197,15 +196,6 @@ class AsyncObcClient:
                         return reading
         except TimeoutError:
             raise NoReplyError(f"unsolicited {wanted}", limit) from None
-
-    async def download_image(
-        self, size: str = "size_128", *, method: str = "frames", within_s: float = 120.0
-    ) -> Image:
-        """Capture and store an image, and download it by `frames` or by `burst`."""
-        if method not in ("frames", "burst"):
-            raise BenchError(f"image download method '{method}': must be frames or burst")
-        download = download_by_frames if method == "frames" else download_by_bursts
-        return await download(self, size, within_s=within_s)
 
     # --- by row ID ---
 

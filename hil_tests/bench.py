@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any, Self
 
 from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S
 from starhil.hil_tests.client import ObcClient
@@ -19,8 +19,6 @@ from starhil.hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAUL
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.candump import bus_name
 from starhil.protocol.definition import InterfaceDefinition
-
-SIGNAL_NUMBERS: Final = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,7 @@ class Bench:
         """
         emulator = self._own_emulator
         self.close_clients()
-        emulator.restart(SIGNAL_NUMBERS[how])
+        emulator.restart(signal.SIGKILL if how == "kill" else signal.SIGTERM)
 
     def __enter__(self) -> Self:
         if self.log_folder is not None:

@@ -48,6 +48,10 @@ class CanopenHostLink(HostLink[CanFrame]):
         self._under_way = request, transfer
         self._send(next(transfer))
 
+    def is_from_device(self, item: CanFrame) -> bool:
+        """Return whether the CAN ID of a frame is one of the node's."""
+        return not item.extended and item.id & 0x7F == self._node
+
     @property
     def busy(self) -> bool:
         """Whether a transfer is active."""

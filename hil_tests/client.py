@@ -8,6 +8,7 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S, AsyncObcClient
 from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE, BenchError
+from starhil.hil_tests.images import download_image
 from starhil.hil_tests.links import (
     DEFAULT_BAUD,
     DEFAULT_DEVICE_ADDRESS,
@@ -32,7 +33,7 @@ T = TypeVar("T")
 def _synchronous(
     method: Callable[Concatenate[AsyncObcClient, Parameters], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[ObcClient, Parameters], T]:
-    """Return a method of `ObcClient` that runs a method of `AsyncObcClient` in the client's loop."""
+    """Return a method of `ObcClient` that runs one of `AsyncObcClient`, or a function of one, in the client's loop."""
 
     @functools.wraps(method)
     def run(client: ObcClient, /, *args: Parameters.args, **fields: Parameters.kwargs) -> T:
@@ -53,26 +54,19 @@ class ObcClient:
             print(obc.wait_for("precise_attitude", lambda reading: reading["valid"], within_s=20))
     """
 
-    def __init__(
-        self,
-        link: HostLink[Any],
-        icd: InterfaceDefinition,
-        *,
-        timeout_s: float = DEFAULT_TIMEOUT_S,
-        retries: int = 0,
-    ) -> None:
-        self.core = AsyncObcClient(link, icd, timeout_s=timeout_s, retries=retries)
-        self.icd = icd
+    def __init__(self, core: AsyncObcClient) -> None:
+        self.core = core
+        self.icd = core.icd
         """The interface definition of the unit."""
-        self.transactions = self.core.transactions
+        self.transactions = core.transactions
         """The latest requests, with outcome and latency."""
-        self.faults = self.core.faults
+        self.faults = core.faults
         """The latest invalid inputs."""
-        self.stray_replies = self.core.stray_replies
+        self.stray_replies = core.stray_replies
         """The latest replies without a request."""
         self._loop = LoopThread("obc-client")
         try:
-            self.run(self.core.start())
+            self.run(core.start())
         except BaseException:
             self._loop.close()
             raise
@@ -109,7 +103,7 @@ class ObcClient:
             link = CanopenHostLink(icd, str(can), log=log)
         else:
             link = CanHostLink(str(can), host_address=host_address, device_address=device_address, log=log)
-        return cls(link, icd, timeout_s=timeout_s, retries=retries)
+        return cls(AsyncObcClient(link, icd, timeout_s=timeout_s, retries=retries))
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine in the client's loop and return its result."""
@@ -136,7 +130,7 @@ class ObcClient:
     read_parameter = _synchronous(AsyncObcClient.read_parameter)
     wait_for = _synchronous(AsyncObcClient.wait_for)
     wait_unsolicited = _synchronous(AsyncObcClient.wait_unsolicited)
-    download_image = _synchronous(AsyncObcClient.download_image)
+    download_image = _synchronous(download_image)
 
     def request(
         self, identifier: int, data: bytes = b"", *, klass: str | None = None, timeout_s: float | None = None

@@ -8,8 +8,9 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
+from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError
 from starhil.hil_tests.transactions import Reading
 from starhil.protocol.image_transfer import (
@@ -25,24 +26,6 @@ from starhil.protocol.image_transfer import (
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Value
 from starid.files import write_atomically
-
-
-class Downloader(Protocol):
-    """The methods of a client that a download uses."""
-
-    bursts: asyncio.Queue[bytes]
-
-    async def command(self, name: str, values: Mapping[str, Value] | None = None) -> object:
-        """Send a telecommand."""
-
-    async def read(self, name: str) -> Reading:
-        """Read telemetry with its latency."""
-        ...
-
-    async def telemetry(self, name: str) -> Mapping[str, Any]:
-        """Read telemetry as values by name."""
-        ...
-
 
 FRAME_ATTEMPTS: Final = 3
 """Number of attempts to read a frame with a wrong checksum."""
@@ -75,24 +58,29 @@ class Image:
     """Duration of the download, without the capture."""
 
 
-async def save_image(client: Downloader, size: str, *, within_s: float) -> None:
+async def download_image(
+    client: AsyncObcClient, size: str = "size_128", *, method: str = "frames", within_s: float = 120.0
+) -> Image:
+    """Capture and store an image, and download it by `frames` or by `burst`."""
+    if method not in ("frames", "burst"):
+        raise BenchError(f"image download method '{method}': must be frames or burst")
+    download = download_by_frames if method == "frames" else download_by_bursts
+    return await download(client, size, within_s=within_s)
+
+
+async def save_image(client: AsyncObcClient, size: str, *, within_s: float) -> None:
     """Capture an image and wait until it is stored."""
-    await client.command("save_image", {"camera": "star", "image_size": size})
-    deadline = time.monotonic() + within_s
-    while True:
-        state = await client.telemetry("image_status")
+
+    def is_stored(state: Reading) -> bool:
         if state["status"] in ("checksum_error", "storage_error"):
             raise BenchError(f"save_image: the device reports {state['status']!r}")
-        if state["percent"] == 100 and state["status"] == "ok":
-            return
-        if time.monotonic() > deadline:
-            raise BenchError(
-                f"save_image: not done within {within_s:g} s ({state['percent']!r} %, {state['status']!r})"
-            )
-        await asyncio.sleep(POLL_S)
+        return state["percent"] == 100 and state["status"] == "ok"
+
+    await client.command("save_image", {"camera": "star", "image_size": size})
+    await client.wait_for("image_status", is_stored, within_s=within_s, every_s=POLL_S)
 
 
-async def download_by_frames(client: Downloader, size: str, *, within_s: float) -> Image:
+async def download_by_frames(client: AsyncObcClient, size: str, *, within_s: float) -> Image:
     """Save an image and download it in frames of 128 bytes, each with a checksum.
 
     Raises BadReplyError: the number or checksum of a frame stays wrong.
@@ -113,7 +101,7 @@ async def download_by_frames(client: Downloader, size: str, *, within_s: float) 
     return Image(bytes(pixels), edge, edge, received, repeats, time.monotonic() - begin)
 
 
-async def _read_frame(client: Downloader, number: int) -> tuple[bytes, int]:
+async def _read_frame(client: AsyncObcClient, number: int) -> tuple[bytes, int]:
     """Read the loaded frame and check it; return it and the number of attempts."""
     problem = ""
     for attempt in range(1, FRAME_ATTEMPTS + 1):
@@ -130,7 +118,9 @@ async def _read_frame(client: Downloader, number: int) -> tuple[bytes, int]:
     raise BadReplyError(f"image frame {number}: {problem}")
 
 
-async def _when_not_busy(client: Downloader, name: str, within_s: float, values: Mapping[str, Value]) -> None:
+async def _when_not_busy(
+    client: AsyncObcClient, name: str, within_s: float, values: Mapping[str, Value]
+) -> None:
     """Send a telecommand, and repeat it while the device reports busy."""
     deadline = time.monotonic() + within_s
     while True:
@@ -147,7 +137,7 @@ async def _when_not_busy(client: Downloader, name: str, within_s: float, values:
 # --- bursts ---
 
 
-async def download_by_bursts(client: Downloader, size: str, *, within_s: float) -> Image:
+async def download_by_bursts(client: AsyncObcClient, size: str, *, within_s: float) -> Image:
     """Save an image, and download the newest file of the list in bursts of up to 1024 numbered packets.
 
     Raises BadReplyError: the list is empty, or the file does not have the checksum in the list.
@@ -171,27 +161,23 @@ async def download_by_bursts(client: Downloader, size: str, *, within_s: float) 
     return Image(pixels, width, height, len(data), repeats, time.monotonic() - begin)
 
 
-async def list_files(client: Downloader, *, within_s: float) -> list[Mapping[str, Any]]:
+async def list_files(client: AsyncObcClient, *, within_s: float) -> list[Mapping[str, Any]]:
     """Return the information of each stored file, as `file_info` reports it, oldest first."""
     await client.command("reset_file_list")
     files: list[Mapping[str, Any]] = []
-    deadline = time.monotonic() + within_s
     while len(files) < FILES_MAX:
-        info = await client.telemetry("file_info")
-        if info["updating"]:
-            if time.monotonic() > deadline:
-                raise BenchError(f"file_info: file {len(files) + 1} not looked up within {within_s:g} s")
-            await asyncio.sleep(POLL_S)
-            continue
-        if not any(info.values()):
+        info = await client.wait_for(
+            "file_info", lambda state: not state["updating"], within_s=within_s, every_s=POLL_S
+        )
+        if not any(info.values.values()):
             return files
-        files.append(info)
+        files.append(info.values)
         await client.command("advance_file_list")
     raise BadReplyError(f"file_info: the list does not end after {FILES_MAX} files")
 
 
 async def _download_block(
-    client: Downloader, counter: int, offset: int, within_s: float
+    client: AsyncObcClient, counter: int, offset: int, within_s: float
 ) -> tuple[bytes, int]:
     """Load one block of the file and receive its packets; return it and the number of repeated requests."""
     block: dict[str, Value] = {
@@ -201,15 +187,13 @@ async def _download_block(
         "length": MAX_BLOCK,
     }
     await _when_not_busy(client, "load_file_block", within_s, block)
-    deadline = time.monotonic() + within_s
-    state = await client.telemetry("file_block")
-    while not state["ready"]:
-        if state["parameter_error"]:
+
+    def is_loaded(state: Reading) -> bool:
+        if state["parameter_error"] and not state["ready"]:
             raise BadReplyError(f"load_file_block: the device has no bytes at {offset} of file {counter}")
-        if time.monotonic() > deadline:
-            raise BenchError(f"load_file_block: offset {offset} not ready within {within_s:g} s")
-        await asyncio.sleep(POLL_S)
-        state = await client.telemetry("file_block")
+        return bool(state["ready"])
+
+    state = await client.wait_for("file_block", is_loaded, within_s=within_s, every_s=POLL_S)
     length = int(state["length"])
     count = packet_count(length)
     packets: dict[int, bytes] = {}
@@ -230,7 +214,7 @@ async def _download_block(
     )
 
 
-async def _gather(client: Downloader, packets: dict[int, bytes], count: int) -> None:
+async def _gather(client: AsyncObcClient, packets: dict[int, bytes], count: int) -> None:
     """Receive burst packets until all have arrived or the line is silent."""
     while len(packets) < count:
         try:
@@ -243,7 +227,7 @@ async def _gather(client: Downloader, packets: dict[int, bytes], count: int) -> 
             packets[number] = data
 
 
-async def _send_hole_map(client: Downloader, packets: dict[int, bytes]) -> None:
+async def _send_hole_map(client: AsyncObcClient, packets: dict[int, bytes]) -> None:
     """Send the device the map of the packets that have arrived."""
     holes = HoleMap(packets)
     for part in range(1, MAP_PARTS + 1):

@@ -28,7 +28,7 @@ from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Reply, Request
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.transports import open_serial
 
 REQUESTED_ROWS: Final = (
@@ -130,7 +130,7 @@ class Echo:
 
     def __init__(self, icd: InterfaceDefinition) -> None:
         self._icd = icd
-        self._stack = build_serial_stack(icd)
+        self._stack = SerialStack(icd)
         self._line = open_serial("pty", paced=False)
         self._arrived: asyncio.Queue[float] = asyncio.Queue()
 

@@ -15,7 +15,7 @@ from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Receiver, Reply, Request
-from starhil.protocol.serial_stack import HostReceiver, build_serial_stack, chosen_dialect
+from starhil.protocol.serial_stack import HostReceiver, SerialStack, chosen_dialect
 from starhil.protocol.transports import Transport, open_can, open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1
@@ -68,6 +68,10 @@ class HostLink(ABC, Generic[Item]):
     def answers(self, row: Row) -> tuple[str, ...]:
         """Return the answers of a row on this link; none if no reply may be awaited."""
         return row.answers
+
+    def is_from_device(self, item: Item) -> bool:  # noqa: ARG002 -- nobody else sends on a line
+        """Return whether the device has sent a received item."""
+        return True
 
     async def start(self) -> None:
         """Open the port or join the bus."""
@@ -138,7 +142,7 @@ class SerialHostLink(HostLink[bytes]):
         baud: int = DEFAULT_BAUD,
         log: WireLog | None = None,
     ) -> None:
-        self._stack = build_serial_stack(icd)
+        self._stack = SerialStack(icd)
         host = partial(self._stack.host, chosen_dialect(icd, dialect))
         super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log, host)
 
@@ -177,3 +181,7 @@ class CanHostLink(HostLink[CanFrame]):
         """Send a request as frames."""
         for frame in encode_request_frames(request, self.host_address, self.device_address):
             self.send(frame)
+
+    def is_from_device(self, item: CanFrame) -> bool:
+        """Return whether the source of a frame is the device."""
+        return item.extended and item.id >> 8 & 0xFF == self.device_address

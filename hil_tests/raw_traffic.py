@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Final
 
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.links import CanHostLink, SerialHostLink
+from starhil.hil_tests.links import HostLink
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
 
@@ -63,7 +63,7 @@ async def send_and_listen(
     client: AsyncObcClient,
     items: Sequence[bytes | CanFrame],
     listen_s: float,
-    wanted: tuple[str, ...] = (),
+    wanted: Sequence[str] = (),
     timeout_s: float | None = None,
 ) -> tuple[str, ...]:
     """Send bytes (serial) or frames (CAN), and return the answer as one text of bytes, or as frames.
@@ -72,16 +72,13 @@ async def send_and_listen(
     patterns in `wanted` have.
     """
     link = client.link
-    if not isinstance(link, (SerialHostLink, CanHostLink)):
-        raise BenchError(f"{link.description}: cannot send raw data")
-    send: Callable[[Any], None] = link.send
     size = len("".join(wanted))
     end = time.monotonic() + (client.timeout_s if timeout_s is None else timeout_s)
-    seen: list[bytes | CanFrame] = []
+    seen: list[Any] = []
     before, link.on_raw = link.on_raw, seen.append
     try:
         for item in items:
-            send(item)
+            link.send(item)
         await asyncio.sleep(listen_s)
         while len("".join(_format_received(link, seen))) < size and time.monotonic() < end:
             await asyncio.sleep(_POLL_S)
@@ -90,10 +87,8 @@ async def send_and_listen(
     return _format_received(link, seen)
 
 
-def _format_received(link: SerialHostLink | CanHostLink, seen: list[bytes | CanFrame]) -> tuple[str, ...]:
+def _format_received(link: HostLink[Any], seen: list[Any]) -> tuple[str, ...]:
     """Return one text of all bytes, or one per frame of the device."""
-    if isinstance(link, SerialHostLink):
-        return (b"".join(item for item in seen if isinstance(item, bytes)).hex().upper(),)
-    device = link.device_address
-    frames = [item for item in seen if isinstance(item, CanFrame) and item.extended]
-    return tuple(format_frame(frame) for frame in frames if frame.id >> 8 & 0xFF == device)
+    if link.name == "serial":
+        return (b"".join(seen).hex().upper(),)
+    return tuple(format_frame(frame) for frame in seen if link.is_from_device(frame))

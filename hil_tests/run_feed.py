@@ -53,27 +53,12 @@ class RunFeed:
         self._thread = threading.Thread(target=self._send, name="run-feed", daemon=True)
         self._thread.start()
 
-    def result(
-        self,
-        name: str,
-        status: str,
-        detail: str,
-        *,
-        identity: str = "",
-        link: str = "",
-        seconds: float = 0.0,
-        traffic: tuple[str, ...] = (),
-    ) -> None:
-        """Report a result; `status` is `passed`, `failed`, `skipped` or `not run`."""
-        content = {
-            "id": identity,
-            "name": name,
-            "status": status,
-            "detail": detail,
-            "link": link,
-            "seconds": round(seconds, 3),
-            "log": list(traffic),
-        }
+    def result(self, **content: Any) -> None:
+        """Report a result.
+
+        Its `status` is `passed`, `failed`, `skipped` or `not run`; the console also shows `id`, `name`, `link`, `seconds`,
+        `detail` and the lines of traffic `log`, of which any may be missing.
+        """
         try:
             self._waiting.put_nowait({"event": "result", "result": content})
         except queue.Full:

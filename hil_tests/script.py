@@ -1,32 +1,7 @@
 """Session scripts: TOML files of telecommands, reads and expectations, validated before the run.
 
-    default_name = "First light"
-
-    [emulator]                      # used by `starhil session --start`
-    profile = "default"
-
-    [truth]                         # the true attitude, or a file that the emulator writes
-    ra_deg = 83.8
-    dec_deg = -1.2
-    roll_deg = 30.0
-
-    [[step]]
-    read = "identification"
-    expect = { interface_version = 1, runtime_s = { max = 60 } }
-    capture = { before = "runtime_s" }
-
-    [[step]]
-    command = "set_mode"
-    with = { mode = "lost_in_space" }
-
-    [[step]]
-    read = "attitude"
-    expect = { valid = true }
-    within_s = 20                   # ask again until the expectations hold
-    attitude = { within_arcsec = 30, roll_within_arcsec = 120 }
-
-Every step has exactly one of the keys in `steps.ACTIONS`. All errors of a file are reported, one a line, with file,
-step, key and near matches.
+`docs/sessions.md` describes the keys. Every step has exactly one of those in `steps.ACTIONS`. All errors of a file are
+reported, one a line, with file, step, key and near matches.
 """
 
 from __future__ import annotations
@@ -64,7 +39,7 @@ class EmulatorRequest(Keys):
     """How `--start` starts the emulator for this script."""
 
     profile: str | None = None
-    settings: Texts = Field((), alias="set")
+    settings: Texts = Field([], alias="set")
     seed: Annotated[int, Field(ge=0)] | None = None
 
 
@@ -89,14 +64,14 @@ class Script(Keys):
     defaults: Defaults = Defaults()
     steps: tuple[Step, ...] = Field((), alias="step")
 
-    def planned(self, links: tuple[str, ...]) -> list[tuple[Step, str]]:
-        """Return each step with each of its links, in order; `links` are those of the bench, "" stands for no link."""
+    def planned(self, links: tuple[str, ...]) -> list[tuple[int, Step, str]]:
+        """Return number, step and link of each step on each of its links; `links` are those of the bench, "" is none."""
 
         def links_of(step: Step) -> tuple[str, ...]:
             wanted = (step.link or self.defaults.link or links[0]) if step.needs_link else ""
             return links if wanted == "both" else (wanted,)
 
-        return [(step, link) for step in self.steps for link in links_of(step)]
+        return [(number, step, link) for number, step in enumerate(self.steps, 1) for link in links_of(step)]
 
 
 def load_script(path: Path, icd: InterfaceDefinition) -> Script:
@@ -123,7 +98,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
     context = {"icd": icd, "captured": captured, "has_truth": bool(document.get("truth"))}
     steps: list[Step | None] = []
     for number, table in enumerate(tables, 1):
-        step, found = _step(f"{path.name}: step {number}", table, {**context, "number": number})
+        step, found = _step(f"{path.name}: step {number}", table, context)
         steps.append(step)
         wrong += found
         names = table.get("capture")

@@ -16,7 +16,7 @@ from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.image_transfer import MAP_PART_SIZE
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.transports import SerialTransport, open_serial
 
 REPLY_WITHIN_S: Final = 2.0
@@ -32,7 +32,7 @@ class _SerialPipeline:
     def __init__(self, icd: InterfaceDefinition, dialect: Dialect) -> None:
         stars = icd.telemetry["identified_stars"]
         hole_map = icd.telecommands["set_hole_map_1"]
-        self._stack = build_serial_stack(icd)
+        self._stack = SerialStack(icd)
         self._receiver = self._stack.host(dialect)
         maps = [(Request.of(hole_map.id, bytes((value,)) * MAP_PART_SIZE), 0) for value in range(1, 8)]
         self._cycle = []

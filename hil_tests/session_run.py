@@ -29,10 +29,9 @@ from starhil.hil_tests.results import (
 )
 from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.script import Script, load_script
-from starhil.hil_tests.session import SessionRunner
+from starhil.hil_tests.session import run_steps
 from starhil.hil_tests.steps import Control, Listen
 from starhil.hil_tests.temporary_folder import temporary_folder
-from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd import load_unit
@@ -98,7 +97,7 @@ def run_session(request: SessionRequest) -> SessionResult:
         with ExitStack() as stack:
             bench = _open_bench(request, script, options, icd, folder, stack)
             show = _shown_on_console(request.view, script, bench, stack, show)
-            result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
+            result = run_steps(script, bench, folder, on_result=show, truth_path=request.truth)
         if all(step.status == SKIPPED for step in result.results) and result.interruption is None:
             result = _failed(result, "at least one step runs", "every step is skipped", show)
     except EmulatorProcessError as error:
@@ -108,7 +107,8 @@ def run_session(request: SessionRequest) -> SessionResult:
     except Interrupted as interruption:  # before the first step, or after the last one
         if result is None:
             reason = f"not run: {interruption.reason}"
-            skipped = (StepResult(step.number, step.name, "", SKIPPED, reason, 0.0) for step in script.steps)
+            steps = enumerate(script.steps, 1)
+            skipped = (StepResult(number, step.name, "", SKIPPED, reason, 0.0) for number, step in steps)
             result = SessionResult(script.title, tuple(skipped), 0.0)
         result = replace(result, interruption=interruption)
     if request.junit is not None:
@@ -123,14 +123,14 @@ def _check_steps(
     path: Path, script: Script, icd: InterfaceDefinition, links: tuple[str, ...], *, start: bool
 ) -> None:
     """Raise ScriptError if a step can never pass on these links, or needs an emulator that the bench starts."""
-    for step, link in script.planned(links):
+    for number, step, link in script.planned(links):
         why = ""
         if step.needs_emulator and not start:
             why = "only an emulator that the bench started can do this: use --start"
         elif isinstance(step, Listen) and link == "can" and icd.link.can is None:
             why = f"unit {icd.name} has only CANopen on CAN, where no row is sent without a request; read it"
         if why:
-            raise ScriptError(f"{path.name}: step {step.number}: {type(step).__name__.lower()}: {why}")
+            raise ScriptError(f"{path.name}: step {number}: {type(step).__name__.lower()}: {why}")
 
 
 def _failed(
@@ -180,31 +180,20 @@ def _shown_on_console(
 
     def show_on_both(result: StepResult) -> None:
         show(result)
-        feed.result(
-            result.name,
-            result.status,
-            result.detail,
-            identity=str(result.number),
-            link=result.link,
-            seconds=result.seconds,
-        )
+        shown = {key: getattr(result, key) for key in ("name", "status", "detail", "link", "seconds")}
+        feed.result(id=str(result.number), **shown)
 
     return show_on_both
 
 
 def _options(request: SessionRequest, script: Script) -> LinkOptions:
     options = request.options
-    if options.dialect not in (None, *Dialect):
-        raise BenchError(f"--dialect {options.dialect}: must be a, b or c")
     if options.serial is None and options.can is None:
         if not request.start:
             raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
-        wanted = {None: ("serial",), "both": ("serial", "can")}.get(
-            script.defaults.link, (script.defaults.link,)
-        )
-        options = replace(
-            options, serial="auto" if "serial" in wanted else None, can="auto" if "can" in wanted else None
-        )
+        wanted = script.defaults.link or "serial"
+        serial, can = ("auto" if wanted in (link, "both") else None for link in ("serial", "can"))
+        options = replace(options, serial=serial, can=can)
     if not request.start and options.serial == "auto":
         raise BenchError("--serial auto needs --start; otherwise name the port")
     return replace(options, timeout_s=script.defaults.timeout_s, retries=script.defaults.retries)
@@ -215,6 +204,7 @@ def _emulator(
 ) -> EmulatorProcess:
     """Prepare an emulator for the session, with an empty parameter store."""
     wanted = script.emulator
+    beside = find_script(request.script).parent / (wanted.profile or "")
     truth_log = None
     if script.truth.file is not None and request.truth is None:
         truth_log = folder / script.truth.file
@@ -222,7 +212,7 @@ def _emulator(
     extra += ["--control", "auto"] if any(isinstance(step, Control) for step in script.steps) else []
     return EmulatorProcess(
         emulator_command(
-            profile=request.profile or _beside(wanted.profile, request.script),
+            profile=request.profile or (str(beside) if beside.is_file() else wanted.profile),
             unit=request.unit,
             serial=options.serial or "off",
             can=options.can or "off",
@@ -234,14 +224,6 @@ def _emulator(
             extra=extra,
         )
     )
-
-
-def _beside(profile: str | None, script: Path) -> str | None:
-    """Return the profile of a script: the file that its relative path names beside the script, or else its name."""
-    if profile is None:
-        return None
-    path = find_script(script).parent / profile
-    return str(path) if path.is_file() else profile
 
 
 def _print_result(console: Console, result: StepResult) -> None:

@@ -2,7 +2,7 @@
 
 The keys of a class are the keys of its step, and a validated step is what the session runs. Rows, fields, parameters
 and names in enumerations are those of the interface definition, which validation takes from its context: `icd`;
-`captured`, the variables of earlier steps; `has_truth`; `number` of the step; and `broken`, its keys that are wrong.
+`captured`, the variables of earlier steps; `has_truth`; and `broken`, the keys of the step that are wrong.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, Field, PlainValidator, ValidationInfo, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo, model_validator
 
 from starhil.hil_tests.attitude import Quaternion
 from starhil.hil_tests.bench import Bench
@@ -44,10 +44,10 @@ from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.codec import Field as RowField
 from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition, UnknownNameError
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.errors import OneLineError, ProtocolError
 from starhil.protocol.names import did_you_mean, remedy
-from starhil.protocol.values import FLAGS, Parameter, Value
+from starhil.protocol.values import FLAGS, EnumDefinition, Parameter, Value
 
 ATTITUDE_FIELDS: Final = frozenset({"q_x", "q_y", "q_z"})
 MS_PER_S: Final = 1e3
@@ -59,75 +59,59 @@ Answer = TypeVar("Answer", Ack, Reading)
 # --- values of keys ---
 
 
-def _icd(info: ValidationInfo) -> InterfaceDefinition:
-    found: InterfaceDefinition = (info.context or {})["icd"]
-    return found
+def _read_by(read: Callable[[str, InterfaceDefinition], Any]) -> PlainValidator:
+    """Return a validator of texts, which a function reads in terms of the definition; its errors are those of the key."""
 
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise ValueError("must be a text")  # noqa: TRY004 -- for pydantic
-    return value
-
-
-def _texts(value: Any) -> tuple[str, ...]:
-    """Return a list of texts; a single text is a list of one."""
-    values = [value] if isinstance(value, str) else value
-    if not isinstance(values, list) or not all(isinstance(item, str) for item in values):
-        raise ValueError("must be a text or a list of texts")
-    return tuple(values)
-
-
-def _known(table: str, others: str = "", instead: str = "") -> PlainValidator:
-    """Return a reader of names in a table of the definition; `instead`: what a name in the table `others` is."""
-
-    def read(value: Any, info: ValidationInfo) -> Any:
-        icd = _icd(info)
-        if others and _text(value) in getattr(icd, others):
-            raise ValueError(f"{value!r} is {instead}")
+    def validate(value: Any, info: ValidationInfo) -> Any:
+        if not isinstance(value, str):
+            raise ValueError("must be a text")  # noqa: TRY004 -- for pydantic
         try:
-            return getattr(icd, table)[_text(value)]
-        except UnknownNameError as error:
+            return read(value, (info.context or {})["icd"])
+        except OneLineError as error:
             raise ValueError(str(error)) from None
 
-    return PlainValidator(read)
+    return PlainValidator(validate)
 
 
-def _member(enum: str) -> PlainValidator:
-    """Return a reader of the names of an enumeration of the definition."""
-
-    def read(value: Any, info: ValidationInfo) -> str:
-        known = sorted(_icd(info).enums[enum].values)
-        if _text(value) not in known:
-            raise ValueError(f"must be one of {', '.join(known)}, not '{value}'{did_you_mean(value, known)}")
-        return str(value)
-
-    return PlainValidator(read)
+def _telemetry(name: str, icd: InterfaceDefinition) -> Row:
+    if name in icd.telecommands:
+        raise ValueError(f"{name!r} is a telecommand: use command")
+    return icd.telemetry[name]
 
 
-def _hex_bytes(value: Any) -> bytes:
+def _telecommand(name: str, icd: InterfaceDefinition) -> Row:
+    if name in icd.telemetry:
+        raise ValueError(f"{name!r} is telemetry: use read")
+    return icd.telecommands[name]
+
+
+def _member(name: str, enum: EnumDefinition) -> str:
+    if name not in enum.values:
+        known = sorted(enum.values)
+        raise ValueError(f"must be one of {', '.join(known)}, not {name!r}{did_you_mean(name, known)}")
+    return name
+
+
+def _hex_bytes(text: str, _icd: InterfaceDefinition) -> bytes:
     try:
-        return bytes.fromhex(_text(value))
+        return bytes.fromhex(text)
     except ValueError:
-        raise ValueError(f'must be bytes in hexadecimal, such as "1F 7F 80 1F FF", not {value!r}') from None
+        raise ValueError(f'must be bytes in hexadecimal, such as "1F 7F 80 1F FF", not {text!r}') from None
 
 
-def _raw_items(value: Any) -> tuple[bytes | CanFrame, ...]:
-    """Read bytes in hexadecimal, or CAN frames in the format of `cansend`."""
-    texts = _texts(value)
-    if len({"#" in text for text in texts}) != 1:
+def _raw_item(text: str, icd: InterfaceDefinition) -> bytes | CanFrame:
+    return parse_frame(text) if "#" in text else _hex_bytes(text, icd)
+
+
+def _of_one_link(items: list[bytes | CanFrame]) -> list[bytes | CanFrame]:
+    if len(set(map(type, items))) != 1:
         raise ValueError("takes bytes in hexadecimal or CAN frames in the format of cansend, not both")
-    try:
-        return tuple(parse_frame(text) if "#" in text else _hex_bytes(text) for text in texts)
-    except BenchError as error:
-        raise ValueError(str(error)) from None
+    return items
 
 
-def _patterns(value: Any) -> tuple[str, ...]:
-    try:
-        return tuple(map(pattern, _texts(value)))
-    except BenchError as error:
-        raise ValueError(str(error)) from None
+def _as_list(value: Any) -> Any:
+    """Return a list of a single text."""
+    return [value] if isinstance(value, str) else value
 
 
 def _as_json(table: dict[str, Any]) -> dict[str, Any]:
@@ -144,16 +128,18 @@ def _file_name(name: str) -> str:
     return name
 
 
-Telemetry = Annotated[Row, _known("telemetry", "telecommands", "a telecommand: use command")]
-Telecommand = Annotated[Row, _known("telecommands", "telemetry", "telemetry: use read")]
-ParameterName = Annotated[Parameter, _known("parameters")]
-Refusal = Annotated[str, _member("error_code")]
-ImageSize = Annotated[str, _member("image_size")]
-HexBytes = Annotated[bytes, PlainValidator(_hex_bytes)]
-RawItems = Annotated[tuple[bytes | CanFrame, ...], PlainValidator(_raw_items)]
-Patterns = Annotated[tuple[str, ...], PlainValidator(_patterns)]
+Telemetry = Annotated[Row, _read_by(_telemetry)]
+Telecommand = Annotated[Row, _read_by(_telecommand)]
+ParameterName = Annotated[Parameter, _read_by(lambda name, icd: icd.parameters[name])]
+Refusal = Annotated[str, _read_by(lambda name, icd: _member(name, icd.enums["error_code"]))]
+ImageSize = Annotated[str, _read_by(lambda name, icd: _member(name, icd.enums["image_size"]))]
+HexBytes = Annotated[bytes, _read_by(_hex_bytes)]
+RawItem = Annotated[bytes | CanFrame, _read_by(_raw_item)]
+RawItems = Annotated[list[RawItem], BeforeValidator(_as_list), AfterValidator(_of_one_link)]
+Pattern = Annotated[str, _read_by(lambda text, _icd: pattern(text))]
+Patterns = Annotated[list[Pattern], BeforeValidator(_as_list)]
 FileName = Annotated[str, AfterValidator(_file_name)]
-Texts = Annotated[tuple[str, ...], PlainValidator(_texts)]
+Texts = Annotated[list[str], BeforeValidator(_as_list)]
 Positive = Annotated[float, Field(ge=0.001)]
 Count = Annotated[int, Field(ge=1)]
 Link = Literal["serial", "can", "both"]
@@ -229,16 +215,10 @@ class Step(Keys):
     timeout_s: Positive | None = None
     retries: Annotated[int, Field(ge=0)] = 0
     max_latency_s: NonNegative | None = None
-    _number: int = 0
 
     @abstractmethod
     def run(self, session: Session, link: str) -> Attempt:
         """Try the action once on a link; `link` is empty for a step that needs none."""
-
-    @property
-    def number(self) -> int:
-        """Place in the script, from 1 on."""
-        return self._number
 
     @property
     def pause_s(self) -> float:
@@ -260,7 +240,6 @@ class Step(Keys):
         problems = [*self._problems(info)]
         if problems:
             raise ValueError(*problems)
-        self._number = (info.context or {})["number"]
         self.name = self.name or self.default_name.format(self=self)
         return self
 
@@ -441,27 +420,23 @@ class Sample(ReadingStep):
             return table
         return {**table, **{"sample" if key == "telemetry" else key: value for key, value in inner.items()}}
 
-    @model_validator(mode="after")
-    def _named_for_its_row(self) -> Self:
-        self.file = self.file or f"{self.row.name}.csv"
-        return self
-
     def run(self, session: Session, link: str) -> Attempt:
         """Read the row for some time; write the values, and judge each reading."""
         client = session.bench.client(link)
+        name = self.file or f"{self.row.name}.csv"
         fields = list(self.row.named_fields)
         latencies: list[float] = []
         crosses: list[float] = []
         problems: list[str] = []
         last = Attempt()
         begin = time.monotonic()
-        with (session.folder / self.file).open("w", newline="", encoding="utf-8", buffering=1) as stream:
+        with (session.folder / name).open("w", newline="", encoding="utf-8", buffering=1) as stream:
             writer = csv.writer(stream)
             writer.writerow(["obc_time_s", "latency_ms", *fields])
             while time.monotonic() - begin < self.for_s or not latencies:
                 reading = client.read(self.row.name, **self.patience)
                 head = f"{reading.received_unix_s:.6f}", f"{reading.latency_s * MS_PER_S:.3f}"
-                writer.writerow([*head, *(_in_csv(reading[name]) for name in fields)])
+                writer.writerow([*head, *(_in_csv(reading[field]) for field in fields)])
                 latencies.append(reading.latency_s)
                 last = self.judged(session, reading)
                 if last.problem is not None:
@@ -476,8 +451,8 @@ class Sample(ReadingStep):
         if crosses:
             measured["cross_boresight_median_arcsec"] = percentile(crosses, 0.5)
             measured["cross_boresight_max_arcsec"] = max(crosses)
-        shown = " ".join(f"{name}={value:.4g}" for name, value in measured.items())
-        detail = f"{count} samples in {self.file}, {count - len(problems)} good, {shown}"
+        shown = " ".join(f"{key}={value:.4g}" for key, value in measured.items())
+        detail = f"{count} samples in {name}, {count - len(problems)} good, {shown}"
         good_share = (count - len(problems)) / count
         problem = None
         if good_share < self.at_least:
@@ -537,7 +512,7 @@ class GetParameter(Step):
         return self._row
 
     def _problems(self, info: ValidationInfo) -> Iterator[str]:
-        self._row = _icd(info).telemetry["parameter"]
+        self._row = (info.context or {})["icd"].telemetry["parameter"]
         yield from super()._problems(info)
 
     def run(self, session: Session, link: str) -> Attempt:
@@ -587,7 +562,7 @@ class Send(Step):
 
     def run(self, session: Session, link: str) -> Attempt:
         """Send the data and compare what comes back."""
-        wanted = self.answer or ()
+        wanted = self.answer or []
         client = session.bench.client(link)
         listening = send_and_listen(client.core, self.data, self.listen_s, wanted, self.timeout_s)
         seen = client.run(listening)
@@ -595,7 +570,7 @@ class Send(Step):
         if self.answer is None:
             return Attempt(detail=f"came back: {shown}")
         if link == "serial":
-            wanted = ("".join(wanted),)
+            wanted = ["".join(wanted)]
         if len(seen) == len(wanted) and all(matches(a, b) for a, b in zip(wanted, seen, strict=True)):
             return Attempt(detail=f"came back: {shown}, as expected")
         return Attempt(problem=f"came back: {shown}, expected {', '.join(filter(None, wanted)) or 'nothing'}")

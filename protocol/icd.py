@@ -29,7 +29,7 @@ from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageCla
 from starhil.protocol.messages import ErrorCode, RequestKind
 from starhil.protocol.names import DEFAULT_UNIT, UNITS_FOLDER, did_you_mean, find_unit
 from starhil.protocol.plugin import Plugin, load_plugin
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.text_messages import words
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import Problem, problems
@@ -93,15 +93,6 @@ def _place(problem: Problem) -> tuple[int | str, ...]:
     if len(location) > 3 and location[2] == "fields":
         return location[:4]
     return location[: 2 if isinstance(location[1 % len(location)], int) else 1]
-
-
-def _name_at(document: Any, place: tuple[int | str, ...]) -> str | None:
-    """Return the name of the table at a place."""
-    try:
-        name = document[place[0]][place[1]]["name"]
-    except (IndexError, KeyError, TypeError):
-        return None
-    return name if isinstance(name, str) else None
 
 
 class _Reader:
@@ -175,12 +166,14 @@ class _Reader:
     def _remove(self, file: Path, document: Any, place: tuple[int | str, ...]) -> None:
         """Remove what is invalid from a document, and record the names that are missing because of that."""
         *path, last = place
-        named = [name for name in (_name_at(document, place[:2]),) if name is not None]
-        self._broken |= {*named, *(name.removeprefix(SETS) for name in named)}
+        table = document[place[0]][place[1]] if len(place) > 1 else None
+        name = table.get("name") if isinstance(table, dict) else None
+        if isinstance(name, str):
+            self._broken |= {name, name.removeprefix(SETS)}
         if place[0] == CLASS or place == (UNIT,):
             self._broken.add(str(place[0]))
         if len(place) == 2 and place[0] in tuple(RequestKind):
-            self._removed.append((file, RequestKind(place[0]), document[place[0]][last]))
+            self._removed.append((file, RequestKind(place[0]), table))
         for step in path:
             document = document[step]
         del document[last]
@@ -474,7 +467,7 @@ def _check_link(icd: InterfaceDefinition) -> None:
         for name in serial.framing.unanswered:
             with Located("link.serial.framing.unanswered"):
                 _find("telecommand", name, icd.telecommands)
-    stack = build_serial_stack(icd)
+    stack = SerialStack(icd)
     for row in icd.rows:
         with Located(f"{row.kind} {row.name}"):
             text_form = stack.request_formats.of(row.klass) in stack.text_formats

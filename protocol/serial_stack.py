@@ -19,7 +19,6 @@ from typing import Final
 from starhil.protocol import cubespace
 from starhil.protocol.checks import build_check
 from starhil.protocol.codec import Row
-from starhil.protocol.conventions import Order
 from starhil.protocol.cubespace import Dialect, DialectReplies
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.envelope import Envelope, Header, HeaderError
@@ -44,11 +43,9 @@ from starhil.protocol.messages import (
     RequestKind,
     error_code,
 )
-from starhil.protocol.plugin import Plugin
 from starhil.protocol.text_messages import TextReplies, words
 from starhil.protocol.values import IcdError
 
-NO_PLUGIN: Final = Plugin()
 LINK_FORMAT: Final = FormatModel()
 """The framing and check of the link itself."""
 
@@ -79,33 +76,31 @@ class _Classes:
 
 
 class SerialStack:
-    """The serial link of a unit: `[link.serial]`, with the unit's classes, rows, byte order and plugin.
+    """The serial link of a unit, with the unit's classes, rows, byte order and plugin.
 
     Attributes
     ----------
     dialects
         The dialects of replies; empty if the unit has only one format. A dialect that is not given is the
         unit's only one, otherwise b.
+
+    Raises IcdError: the unit has no serial link, or parts of it are incompatible.
     """
 
-    def __init__(
-        self,
-        link: SerialLinkModel,
-        classes: Sequence[MessageClass] = (),
-        rows: Sequence[Row] = (),
-        byte_order: Order = "little",
-        plugin: Plugin = NO_PLUGIN,
-    ) -> None:
+    def __init__(self, icd: InterfaceDefinition) -> None:
+        if icd.link.serial is None:
+            raise IcdError(f"unit {icd.name}: has no serial link")
+        link, rows = icd.link.serial, tuple(icd.rows)
         self.link: Final = link
-        self.classes: Final = _Classes(classes)
-        self.rows: Final = tuple(rows)
-        self.byte_order: Final = byte_order
+        self.classes: Final = _Classes(icd.classes)
+        self.rows: Final = rows
+        self.byte_order: Final = icd.conventions.byte_order
         self.dialects: Final = dialects_of(link)
-        self._plugin = plugin
+        self._plugin = icd.plugin
         self._unanswered = link.framing.unanswered if isinstance(link.framing, CubeSpaceFraming) else []
         self._silent = {row.id for row in rows if not self.answers(row)}
-        self._rows = {(row.klass, row.id): row for row in rows}
-        self._rows_by_id = {row.id: row for row in reversed(self.rows)}
+        self._rows = icd.rows_by_key
+        self._rows_by_id = {row.id: row for row in reversed(rows)}
         self._by_text = {words(row.request): row for row in rows if row.request}
         self._unknown_id = max((row.id for row in rows), default=0) + 1
         """ID of a request with an unknown text."""
@@ -529,14 +524,3 @@ def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | No
     if wanted not in dialects:
         raise IcdError(f"unit {icd.name} has only dialect {', '.join(dialects)}; do not select another")
     return Dialect(wanted)
-
-
-def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
-    """Return the serial link of a definition.
-
-    Raises IcdError: the unit has none, or parts of it are incompatible.
-    """
-    link = icd.link.serial
-    if link is None:
-        raise IcdError(f"unit {icd.name}: has no serial link")
-    return SerialStack(link, icd.classes, tuple(icd.rows), icd.conventions.byte_order, icd.plugin)

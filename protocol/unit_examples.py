@@ -18,7 +18,7 @@ from starhil.protocol.link_schema import CustomFraming
 from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.names import find_unit
 from starhil.protocol.plugin import guarded
-from starhil.protocol.serial_stack import SerialStack, build_serial_stack, chosen_dialect
+from starhil.protocol.serial_stack import SerialStack, chosen_dialect
 from starhil.protocol.values import IcdError, Value
 
 HOST_ADDRESS, DEVICE_ADDRESS = 1, 4
@@ -43,7 +43,7 @@ def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
     If the framing cannot carry these, they are the default values. Raises ProtocolError for a row whose defaults
     contradict its limits.
     """
-    stack = None if icd.link.serial is None or icd.link_is_unknown else build_serial_stack(icd)
+    stack = None if icd.link.serial is None or icd.link_is_unknown else SerialStack(icd)
     for row in icd.rows:
         if stack is not None:
             try:

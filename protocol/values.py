@@ -216,6 +216,8 @@ class ParameterKeys(DefinitionModel):
     """None if the type or the enumeration gives it."""
     maximum: float | None = Field(default=None, alias="max")
     default: Scalar
+    profile_key: str = ""
+    """Key of a device profile that sets the default, of a parameter of a link."""
     doc: str
 
 

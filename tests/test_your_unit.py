@@ -14,7 +14,7 @@ from starhil.emulator.profile import Profile
 from starhil.protocol.framings import Receiving
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import FaultKind
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from tests.emulator.conftest import FakePipeline
 from tests.emulator.runs import FakeImager
 from tests.test_docs import blocks, programs, run
@@ -85,7 +85,7 @@ def test_the_framing_of_the_page_carries_every_message(tmp_path):
     assert (
         "  > 01 03 0B C0 0B 01 10 01 02 03 04" in result.stdout
     )  # length 12 - 1, sequence 0, group 1, ID 16
-    stack = build_serial_stack(load_unit(folder))
+    stack = SerialStack(load_unit(folder))
     request = load_unit(folder).request_of(0x10, "command", bytes(6))
     line = stack.encode_request(request)
     device = stack.device()

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
-from starhil.emulator.cli.options import BenchOptions, list_option, names_of
+from starhil.emulator.cli.options import BenchOptions, checked_dialect, list_option, names_of
 from starid.cli.options import AsJson
 
 
@@ -44,7 +44,12 @@ def command(
     from starhil.hil_tests.session_run import SessionRequest, run_session
 
     links = LinkOptions(
-        bench.serial, bench.can, bench.dialect, baud, bench.host_address, bench.device_address
+        bench.serial,
+        bench.can,
+        checked_dialect(bench.dialect),
+        baud,
+        bench.host_address,
+        bench.device_address,
     )
     request = SessionRequest(
         script,

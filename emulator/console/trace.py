@@ -17,7 +17,7 @@ from starhil.protocol.canopen.sdo_client import requests_of, row_transfer
 from starhil.protocol.codec import Row
 from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 
 KEPT_ITEMS: Final = 20_000
 """Number of items kept for export."""
@@ -104,7 +104,7 @@ class RequestEncoder:
 
     def __init__(self, icd: InterfaceDefinition) -> None:
         self._icd = icd
-        self._stack = build_serial_stack(icd) if icd.link.serial is not None else None
+        self._stack = SerialStack(icd) if icd.link.serial is not None else None
         self._objects = DeviceDictionary(icd) if icd.canopen_only else None
 
     def encode(self, row: Row, data: bytes, host: int, device: int) -> dict[str, Any]:

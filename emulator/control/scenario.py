@@ -32,6 +32,7 @@ from starhil.emulator.head import Head
 from starhil.emulator.toml_file import find_toml, read_toml
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.truth import Truth
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
 
@@ -105,6 +106,9 @@ def load_scenario(name_or_path: str) -> Scenario:
     """Read a scenario from a path, or by the name of one in `configs/scenarios`."""
     path = find_toml("scenario", name_or_path)
     values = read_toml(path, "scenario")
+    if "at" not in values:
+        known = did_you_mean("at", values) or f"; its keys are {', '.join(values) or 'none'}"
+        raise EmulatorError(f"scenario {path}: not a scenario: has no events, each under [[at]]{known}")
     try:
         return Scenario.model_validate(values)
     except ValidationError as error:

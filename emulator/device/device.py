@@ -27,7 +27,7 @@ from starhil.emulator.guard import log_internal_error, one_line
 from starhil.emulator.output_file import Output
 from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.pipeline.messages import IDENTITY, Quaternion
-from starhil.emulator.profile import LINK_PARAMETERS, Profile
+from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.codec import Field
 from starhil.protocol.definition import InterfaceDefinition
@@ -330,7 +330,9 @@ def adopt_camera(parameters: Parameters, profile: Profile, constants: Mapping[st
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:
     """Return the parameter defaults of a profile: its `[parameters]`, and settings in its `[links]`."""
     of_links: dict[str, Any] = {
-        name: reduce(getattr, key.split("."), profile) for name, key in LINK_PARAMETERS.items()
+        name: reduce(getattr, item.profile_key.split("."), profile)
+        for name, item in icd.device_parameters.items()
+        if item.profile_key
     }
     unit_serial = icd.link.serial
     if unit_serial is not None and "baud" not in profile.links.serial.model_fields_set:

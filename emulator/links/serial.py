@@ -11,7 +11,7 @@ from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
 from starhil.protocol.cubespace import Dialect
 from starhil.protocol.messages import Receiver, Reply, Request
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.transports.paced import SerialTransport
 
 JUNK_BYTES: Final = 8
@@ -52,7 +52,7 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
         self, requests: Requests, transport: SerialTransport, seed: int = 0, *, console: bool = False
     ) -> None:
         self._console = console
-        self._stack = build_serial_stack(requests.device.icd)
+        self._stack = SerialStack(requests.device.icd)
         super().__init__(requests, transport, SerialDamage(), seed)
         self._port = transport
         self._baud = self._wanted_baud()

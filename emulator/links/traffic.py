@@ -16,7 +16,7 @@ from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_stack import HostReceiver, build_serial_stack
+from starhil.protocol.serial_stack import HostReceiver, SerialStack
 from starhil.protocol.values import Value
 
 SHOWN_VALUES: Final = 8
@@ -75,7 +75,7 @@ class Decoder:
     def __init__(self, icd: InterfaceDefinition, dialect: Callable[[], Dialect | None]) -> None:
         self._icd = icd
         self._dialect = dialect
-        self._stack = build_serial_stack(icd) if icd.link.serial is not None else None
+        self._stack = SerialStack(icd) if icd.link.serial is not None else None
         self._to_device = self._stack.device() if self._stack is not None else None
         self._from_device: tuple[Dialect | None, HostReceiver] | None = None
         self._can: dict[tuple[bool, int], CanDeviceReceiver | CanHostReceiver] = {}

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -147,9 +148,11 @@ def run_conformance(
     facts = _facts(request, unit)
     complete = False
 
+    listeners = [outcomes.append, on_outcome]
+
     def record(outcome: Outcome) -> None:
-        outcomes.append(outcome)
-        on_outcome(outcome)
+        for listener in listeners:
+            listener(outcome)
 
     try:
         with ExitStack() as stack:
@@ -161,22 +164,27 @@ def run_conformance(
                 if "control" in emulator.ready:
                     control = stack.enter_context(ControlClient(emulator.ready["control"]))
                     truth = Truth(control, unit.conventions).attitude
-            shown: Callable[[Outcome], None] = record
             if request.view is not None:
-                address = console_address(request.view, emulator)
                 where = " ".join(port for link in ("serial", "can") if (port := ports.get(link)))
-                shown = _shown_on_console(address, where, len(cases), stack, record)
+                address = console_address(request.view, emulator)
+                feed = stack.enter_context(
+                    RunFeed(address, kind="conformance", title="Conformance", unit=where, planned=len(cases))
+                )
+                listeners.append(partial(_send_to_console, feed))
             links = {item.id.partition(".")[0] for item in cases}
             for probe, port in _probes(request, unit, links, ports, stack):
                 probe.truth = truth
                 facts[f"device on {probe.link}"] = identity_of(probe)
                 mine = [item for item in cases if item.id.startswith(f"{probe.link}.")]
-                run_cases(probe, mine, shown, port=port)
+                run_cases(probe, mine, record, port=port)
             complete = True
     except EmulatorProcessError as error:
         if not complete:
             raise
-        record(_outcome_of_early_end(error))
+        end = case_of_run(
+            "emulator.end", "the emulator runs until it is ended, and ends cleanly", "starhil run"
+        )
+        record(Outcome.of(end, CaseFailed("exit with status 0 on request", str(error))))
     except Interrupted as interruption:
         done = {outcome.id for outcome in outcomes}
         for item in cases:
@@ -206,26 +214,15 @@ def truth_source(text: str) -> TruthSource:
     return lambda: attitude
 
 
-def _shown_on_console(
-    address: str, unit: str, planned: int, stack: ExitStack, record: Callable[[Outcome], None]
-) -> Callable[[Outcome], None]:
-    """Return a function that shows an outcome on the console too."""
-    feed = stack.enter_context(
-        RunFeed(address, kind="conformance", title="Conformance", unit=unit, planned=planned)
+def _send_to_console(feed: RunFeed, outcome: Outcome) -> None:
+    feed.result(
+        id=outcome.id,
+        name=outcome.title,
+        status=outcome.status,
+        detail=outcome.detail,
+        seconds=outcome.seconds,
+        log=outcome.log if outcome.status == FAILED else (),
     )
-
-    def record_on_both(outcome: Outcome) -> None:
-        record(outcome)
-        feed.result(
-            outcome.title,
-            outcome.status,
-            outcome.detail,
-            identity=outcome.id,
-            seconds=outcome.seconds,
-            traffic=outcome.log if outcome.status == FAILED else (),
-        )
-
-    return record_on_both
 
 
 def _probes(
@@ -259,21 +256,12 @@ def _probes(
         yield _canopen_probe(request, can, stack), f"{can} at node {request.canopen_node}"
 
 
-def _outcome_of_early_end(error: EmulatorProcessError) -> Outcome:
-    """Return the outcome for an emulator that ended early; earlier outcomes are kept."""
-    case = case_of_run("emulator.end", "the emulator runs until it is ended, and ends cleanly", "starhil run")
-    return Outcome.of(case, CaseFailed("exit with status 0 on request", str(error)))
-
-
 def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
     """Start an emulator with the requested links."""
     folder = stack.enter_context(temporary_folder("starhil-"))
-    needs_bus = request.can is not None or request.canopen_node is not None
-    channel = "off"
-    if needs_bus:
-        channel = (
-            stack.enter_context(private_can_bus()) if request.can in (None, "auto") else str(request.can)
-        )
+    channel = request.can or "off"
+    if channel == "auto":
+        channel = stack.enter_context(private_can_bus())
     extra = ["--control", f"unix:{folder}/control"]
     if request.canopen_node is not None:
         extra += ["--canopen", str(request.canopen_node)]

@@ -41,10 +41,8 @@ RESTING: Final = 5
 """Number of attempts to read two rows between two measurements."""
 F32_ROUNDING: Final = 1e-6
 CLOCK_S: Final = 1_700_000_000
-OF_LINKS: Final = frozenset({
-    "can_address", "host_address", "serial_dialect", "serial_baud", "canopen_node", "unsolicited_rate", "unsolicited_selection",
-})  # fmt: skip
-"""Parameters that change how a unit is reached, or what it sends unasked: no values are tried."""
+UNASKED: Final = frozenset({"unsolicited_rate", "unsolicited_selection"})
+"""Parameters that change what a unit sends unasked: no values are tried, nor of those that change how it is reached."""
 TIGHT: Final = frozenset({"delay_time", "orbit_eccentricity"})
 """Parameters that may only have the present value, because all others contradict the exposure, the update rate or the orbit."""
 PUBLISHED_IDS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
@@ -230,9 +228,10 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
             alone = sum(other is row for _, other, _ in unit.reported_data) == 1
             name = row.name if alone else f"{row.name}.{command.name}"
             yield case_in("settings", name, title, run, row, intrusive=True)
+    untried = UNASKED | {name for name, item in unit.device_parameters.items() if item.of_link}
     for command in unit.telecommands.values():
         fields = {_quantity(item): name for name, item in command.named.items() if item.parameter is not None}
-        if command.action != "set_parameters" or not fields or OF_LINKS & {item[0] for item in fields}:
+        if command.action != "set_parameters" or not fields or untried & {item[0] for item in fields}:
             continue
         for row in unit.telemetry.values():
             places = {

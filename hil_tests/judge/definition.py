@@ -34,6 +34,8 @@ class Parameter:
     maximum: float
     default: bool | int | float | str
     enum: Mapping[str, int] | None
+    of_link: bool
+    """Whether it changes how the unit is reached."""
 
     @property
     def default_number(self) -> float:
@@ -199,7 +201,9 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
 def _parameter(item: Any) -> Parameter:
     enum = None if item.enum is None else item.enum.values
     limits = item.minimum, item.maximum
-    return Parameter(item.id, item.name, item.type, item.unit, *limits, item.default, enum)
+    return Parameter(
+        item.id, item.name, item.type, item.unit, *limits, item.default, enum, bool(item.profile_key)
+    )
 
 
 def _row(row: Any, icd: InterfaceDefinition) -> Row:

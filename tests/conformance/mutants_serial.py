@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from starhil.protocol.cubespace import Dialect
+from starhil.protocol.link_schema import LinkModel
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_stack import SerialStack
 from tests.conformance.mutant_seams import (
@@ -88,7 +89,8 @@ enter(
 def _receiving_with(unit: SimulatedUnit, **limits: float) -> None:
     """Receive with other limits, which are keys of [link.serial]."""
     link = unit.link._stack.link.model_copy(update=limits)
-    unit.link._receiver = SerialStack(link).device()
+    icd = dataclasses.replace(unit.device.icd, link=LinkModel(serial=link))
+    unit.link._receiver = SerialStack(icd).device()
 
 
 @mutant("incomplete messages never time out", "serial", "framing.half")

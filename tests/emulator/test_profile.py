@@ -220,6 +220,10 @@ def test_overrides_are_toml_or_text():
         ("[truth]\nkind = 'rate'\nrate = [0, 0, 1]\n", "truth.rate: unknown key; did you mean rate_deg_s?"),
         ("[truth]\nkind = 'rate'\nrate_rad_s = [0, 0, 1]\n", "truth.rate_"),
         ("[truth]\nkind = 'fixed'\nattitude = {ra_deg = 1.0}\n", "give ra_deg and dec_deg"),
+        (
+            "[truth]\nkind = 'fixed'\nra_deg = 1.0\n",
+            "truth.ra_deg: unknown key; did you mean attitude.ra_deg?",
+        ),
         ("[truth]\nkind = 'fixed'\nattitude = {quaternion_xyzw = [1.0, 1.0, 0.0, 0.0]}\n", "not of length 1"),
         ("[truth]\nkind = 'slew'\nsegments = [{do = 'hold', secs = 1.0}]\n", "truth.segments.0.sec"),
         ("[parameters]\nserial_baud = 9600\n", "parameters.serial_baud: set links.serial.baud instead"),

@@ -222,7 +222,8 @@ def test_every_scenario_of_the_product_is_valid(name):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "at: missing"),
+        ("", "not a scenario: has no events, each under [[at]]; its keys are none"),
+        ("[run]\nseed = 1\n[truth]\nkind = 'fixed'\n", "its keys are run, truth"),
         ("[[at]]\nrun_time_s = 1.0\n", "give fault, truth or clear_faults"),
         (
             "[[at]]\nrun_time_s = 1.0\nfault = { optical = { false_star = 1 } }\n",

@@ -29,7 +29,7 @@ from starhil.protocol.canopen.storage import FileStorage
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FORMATS, export
 from starhil.protocol.icd import load_unit
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starid.attitude import Attitude
 from starid.camera_file import load_camera
 from starid.hipparcos import read_hip2
@@ -88,7 +88,7 @@ def exported(path: Path) -> None:
     """Read a unit, frame its rows and export it in every format."""
     icd = load_unit(path)
     if icd.link.serial is not None:
-        stack = build_serial_stack(icd)
+        stack = SerialStack(icd)
         for row in icd.rows:
             stack.encode_request(icd.request(row, bytes(row.size) if row.kind == "telecommand" else b""))
     for name in FORMATS:

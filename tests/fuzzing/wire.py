@@ -30,7 +30,7 @@ from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import parse_burst_packet
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.names import bundled_units
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
 from tests.emulator.conftest import Bench
 from tests.fuzzing.target import DOCUMENTED, NESTED, TARGETS, Run, Target, chunks, target
@@ -71,7 +71,7 @@ def examined(unit: str, events: Any) -> int:
 
 def serial_seeds(unit: str, *, device: bool) -> list[bytes]:
     """Good messages, each as one chunk."""
-    stack = build_serial_stack(load_unit(unit))
+    stack = SerialStack(load_unit(unit))
     requests, replies = rows_of(unit)
     messages = map(stack.encode_request, requests) if device else map(stack.encode_reply, replies)
     return [bytes([31]) + message for message in messages if message]
@@ -79,7 +79,7 @@ def serial_seeds(unit: str, *, device: bool) -> list[bytes]:
 
 def serial_device(unit: str, _folder: Path) -> Run:
     """The device's end of a serial line; afterwards it reads a good request."""
-    stack = build_serial_stack(load_unit(unit))
+    stack = SerialStack(load_unit(unit))
     good = rows_of(unit)[0][-1]
 
     def run(data: bytes) -> None:
@@ -97,7 +97,7 @@ def serial_device(unit: str, _folder: Path) -> Run:
 def serial_host(unit: str, _folder: Path) -> Run:
     """The OBC's end of a serial line, which expects the reply to the row that the first byte selects."""
     icd = load_unit(unit)
-    stack = build_serial_stack(icd)
+    stack = SerialStack(icd)
     rows = list(icd.rows)
 
     def run(data: bytes) -> None:

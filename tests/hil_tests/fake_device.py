@@ -12,7 +12,7 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import file_checksum
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.transports import open_can, open_serial
 
 ICD = load_unit()
@@ -55,7 +55,7 @@ class FakeDevice:
     def __post_init__(self):
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
-        self._stack = build_serial_stack(ICD)
+        self._stack = SerialStack(ICD)
         self._receiver = self._stack.device()
         self._can_receiver = CanDeviceReceiver(4)
         self._file = bmp_file()

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import time
 
 import pytest
 
+from starhil.hil_tests.async_client import AsyncObcClient
+from starhil.hil_tests.canopen_link import CanopenHostLink
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
 from starhil.hil_tests.images import list_files
-from starhil.hil_tests.raw_traffic import send_and_listen
+from starhil.hil_tests.raw_traffic import parse_frame, send_and_listen
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import UnknownNameError
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.transports import open_can
 from starhil.protocol.values import FieldError
 from tests.hil_tests.fake_device import EDGE, FakeDevice, bmp_file
 
@@ -271,6 +276,25 @@ def test_raw_bytes_and_frames_can_be_sent(pair):
         answer = (f"1F{start}{identifier}001F1F000000001FFF",)
         sent = [b"\x1f\x7f", b"\x81\x1f\xff"]
     assert client.run(send_and_listen(client.core, sent, 0.0, answer, PATIENCE_S)) == answer
+
+
+def test_raw_frames_can_be_sent_to_a_canopen_node_of_which_the_answer_is_shown():
+    async def scenario():
+        node, link = open_can("virtual:raw"), CanopenHostLink(load_unit(), "virtual:raw", node=44)
+        answers = [
+            CanFrame(can_id, b"\x60", extended=extended)
+            for can_id, extended in ((0x5AC, True), (0x5AD, False), (0x5AC, False))
+        ]
+        await node.start(lambda _frame: [node.send(frame) for frame in answers])
+        client = AsyncObcClient(link, load_unit(), timeout_s=PATIENCE_S)
+        await client.start()
+        try:
+            return await send_and_listen(client, [parse_frame("62C#4018100400000000")], 0.0, ["5AC#.."])
+        finally:
+            await client.close()
+            await node.close()
+
+    assert asyncio.run(scenario()) == ("5AC#60",)
 
 
 def test_ports_that_are_not_available_are_rejected_in_one_line():

@@ -72,10 +72,13 @@ def test_an_emulator_that_dies_at_the_last_step_fails_the_session_and_its_report
     with hub_thread() as channel:
         process = EmulatorProcess([sys.executable, "-c", DIES.format(channel)])
         monkeypatch.setattr(session_run, "_emulator", lambda *_arguments: process)
-        run = session_run.SessionRunner.run
-        monkeypatch.setattr(
-            session_run.SessionRunner, "run", lambda self: (process.process.wait(timeout=60), run(self))[1]
-        )
+        run = session_run.run_steps
+
+        def run_after_its_end(*arguments, **options):
+            process.process.wait(timeout=60)
+            return run(*arguments, **options)
+
+        monkeypatch.setattr(session_run, "run_steps", run_after_its_end)
         words = ("--start", "--can", channel, "--log", tmp_path, "--junit", junit, "--json")
         outcome = run_command("session", script, *words)
     assert outcome.exit_code == 1, outcome.output

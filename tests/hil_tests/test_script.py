@@ -84,7 +84,7 @@ def test_a_full_script_is_read_unchanged(load):
         "All parts", 0.5, 1, True, "both",
     )  # fmt: skip
     assert (script.emulator.profile, script.emulator.settings, script.emulator.seed) == (
-        "demo", ("truth.ra_deg=83.8",), 3,
+        "demo", ["truth.ra_deg=83.8"], 3,
     )  # fmt: skip
     assert script.truth.attitude == from_radec_roll(83.8, -1.2, 30.0)
     read, clock, attitude, sample, send, wait = script.steps
@@ -165,7 +165,7 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
         ("[truth]\nfile = '/etc/victim'\n[[step]]\nwait_s = 1", ["truth.file: ", "plain file name"]),
         ('[truth]\nfile = "a\\u0000b"\n[[step]]\nwait_s = 1', ["truth.file: ", "plain file name"]),
         ("[[step]]\ndownload_image = 'x.png'\nsize = 'size_100'", ["size_100", "size_1024"]),
-        ("[[step]]\nsend = 'zz'", ["send: must be bytes in hexadecimal"]),
+        ("[[step]]\nsend = 'zz'", ["send.0: must be bytes in hexadecimal"]),
         ("[[step]]\nsend = ['1F', '123#00']", ["not both"]),
         ("[[step]]\nsend = '123#001'", ["not a CAN frame"]),
         ("[[step]]\nread = 'rates'\nlink = 'i2c'", ["i2c", "can"]),
@@ -174,7 +174,7 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
         ("[[step]\n", ["not valid TOML"]),
         ("[[step]]\nread = 3", ["read: must be a text"]),
         ("[[step]]\nread = 'rates'\nexpect = 3", ["expect: must be a table"]),
-        ("[[step]]\nsend = 3", ["send: must be a text or a list of texts"]),
+        ("[[step]]\nsend = 3", ["send: must be a list"]),
         ("[[step]]\ncommand = 'set_mode'\nwith_hex = 'zz'", ["with_hex: must be bytes in hexadecimal"]),
         ("step = 3", ["'step' must be an array of tables"]),
         ("[emulator]\nseed = 'x'\n[[step]]\nwait_s = 1", ["emulator.seed: must be a whole number"]),

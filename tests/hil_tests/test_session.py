@@ -21,10 +21,11 @@ from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.results import junit_cases
 from starhil.hil_tests.script import load_script
-from starhil.hil_tests.session import SessionRunner
+from starhil.hil_tests.session import run_steps
 from starhil.hil_tests.session_run import SessionRequest, _emulator, _print_result, run_session
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
+from starid.errors import StaridError
 from tests.candump import read_candump
 from tests.hil_tests.fake_device import FakeDevice
 
@@ -48,7 +49,7 @@ def play(device, tmp_path):
         script = load_script(path, ICD)
         options = LinkOptions(serial=port, can=can, timeout_s=script.defaults.timeout_s)
         with Bench(options, ICD, log_folder=tmp_path) as bench:
-            return SessionRunner(script, bench, tmp_path).run()
+            return run_steps(script, bench, tmp_path)
 
     return _play
 
@@ -78,7 +79,7 @@ def test_listen_checks_only_messages_after_its_start(device, hub, tmp_path):
         sender = threading.Thread(target=send)
         sender.start()
         try:
-            (result,) = SessionRunner(script, bench, tmp_path).run().results
+            (result,) = run_steps(script, bench, tmp_path).results
         finally:
             pause.set()
             sender.join()
@@ -157,7 +158,7 @@ def test_after_a_failed_step_the_rest_is_skipped_without_keep_going(device, tmp_
     path = tmp_path / "s.toml"
     path.write_text("[[step]]\nread = 'rates'\nexpect = { rate_x = 9 }\n[[step]]\nread = 'rates'\n")
     with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
-        result = SessionRunner(load_script(path, ICD), bench, tmp_path).run()
+        result = run_steps(load_script(path, ICD), bench, tmp_path)
     assert [item.status for item in result.results] == ["failed", "skipped"]
 
 
@@ -173,7 +174,7 @@ def test_finished_steps_keep_their_result_when_a_signal_comes_as_one_is_shown(de
             raise Interrupted(signal.SIGTERM)
 
     with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
-        result = SessionRunner(load_script(path, ICD), bench, tmp_path, on_result=show).run()
+        result = run_steps(load_script(path, ICD), bench, tmp_path, on_result=show)
     assert [item.status for item in result.results] == ["passed"] * (moment + 1) + ["skipped"] * (2 - moment)
     assert result.results[-1].detail == "not run: interrupted by SIGTERM"
     assert result.interruption is not None
@@ -259,8 +260,8 @@ def test_a_truth_log_that_is_given_takes_the_place_of_the_truth_of_the_script(de
     log.write_text("\n".join(["time_of_exposure_s,true_qx,true_qy,true_qz,true_qw", *rows]))
     with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
         for truth, status in ((None, "passed"), (log, "failed")):
-            runner = SessionRunner(load_script(script, ICD), bench, tmp_path, truth_path=truth)
-            assert runner.run().results[0].status == status
+            result = run_steps(load_script(script, ICD), bench, tmp_path, truth_path=truth)
+            assert result.results[0].status == status
 
 
 @pytest.mark.parametrize("own", ["", "truth.kind=rate"])
@@ -436,7 +437,7 @@ def test_one_unsolicited_message_is_judged_without_a_rate(device, hub, tmp_path,
         bench.client("can").read("rates")
         timer = threading.Timer(0.2, device.say, ["precise_attitude", {"frame_counter": 7}])
         timer.start()
-        (result,) = SessionRunner(script, bench, tmp_path).run().results
+        (result,) = run_steps(script, bench, tmp_path).results
         timer.join()
     assert (result.status, "rate_hz" in result.figures) == (status, False), result.detail
 
@@ -466,7 +467,7 @@ def test_listen_takes_each_message_from_the_begin_of_the_step(device, hub, tmp_p
         bench.client("can").read("rates")
         timer = threading.Timer(0.5, say)
         timer.start()
-        (result,) = SessionRunner(load_script(path, ICD), bench, tmp_path).run().results
+        (result,) = run_steps(load_script(path, ICD), bench, tmp_path).results
         timer.join()
     assert result.status == "passed", result.detail
     assert result.seconds < 2.0
@@ -575,6 +576,6 @@ def test_listening_where_no_row_comes_without_a_request_is_rejected_before_the_f
 )
 def test_bad_input_is_rejected(words, message, tmp_path):
     outcome = run_command(*words, "--log", tmp_path / "log")
-    assert isinstance(outcome.exception, BenchError)
+    assert isinstance(outcome.exception, BenchError | StaridError)
     assert message in str(outcome.exception)
     assert not (tmp_path / "log").exists()

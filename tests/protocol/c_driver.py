@@ -18,7 +18,7 @@ from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.c import files, prefix_of
 from starhil.protocol.quoting import c_member
-from starhil.protocol.serial_stack import SerialStack, build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.values import Value
 
 FLAGS = [
@@ -308,7 +308,7 @@ class CDriver:
     def __init__(self, icd: InterfaceDefinition, folder: Path, stack: SerialStack | None = None) -> None:
         if COMPILER is None:
             pytest.skip("no C compiler (cc, gcc or clang) here: the exported C is not compiled")
-        stack = stack or build_serial_stack(icd)
+        stack = stack or SerialStack(icd)
         for name, text in files(icd, stack).items():
             (folder / name).write_text(text)
         (folder / "driver.c").write_text(driver_source(icd, composed=not stack.dialects))

@@ -6,8 +6,10 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from starhil.protocol.codec import Row
+from starhil.protocol.conventions import Conventions
+from starhil.protocol.definition import InterfaceDefinition, Names
 from starhil.protocol.icd import load_unit
-from starhil.protocol.link_schema import MessageClass, SerialLinkModel
+from starhil.protocol.link_schema import LinkModel, MessageClass, SerialLinkModel
 from starhil.protocol.messages import (
     ErrorCode,
     FaultKind,
@@ -17,7 +19,8 @@ from starhil.protocol.messages import (
     Request,
     RequestKind,
 )
-from starhil.protocol.serial_stack import SerialStack, build_serial_stack
+from starhil.protocol.plugin import Plugin
+from starhil.protocol.serial_stack import SerialStack
 
 TC, TLM = RequestKind.TELECOMMAND, RequestKind.TELEMETRY
 
@@ -49,11 +52,30 @@ def stack_of(
     rows: tuple[Row, ...] = (),
     order: Any = "little",
 ) -> SerialStack:
-    return SerialStack(SerialLinkModel.model_validate(link), classes, rows, order)
+    return SerialStack(definition(link, classes, rows, order))
+
+
+def definition(
+    link: dict[str, Any],
+    classes: tuple[MessageClass, ...] = (),
+    rows: tuple[Row, ...] = (),
+    order: Any = "little",
+    plugin: Plugin | None = None,
+) -> InterfaceDefinition:
+    """Return a unit that has only a serial link, with the rows in the order of their IDs."""
+    named = [(f"{row.klass} {row.id}", row) for row in rows]
+    telecommands = [(name, row) for name, row in named if row.kind is TC]
+    return InterfaceDefinition(
+        "test", "1", "", Names("telecommand", telecommands),
+        Names("telemetry", [item for item in named if item not in telecommands]),
+        Names("enum", ()), Names("parameter", ()), Names("parameter", ()),
+        link=LinkModel(serial=SerialLinkModel.model_validate(link)), conventions=Conventions(byte_order=order),
+        classes=classes, plugin=plugin or Plugin(),
+    )  # fmt: skip
 
 
 CUBESPACE = stack_of({"framing": {"kind": "cubespace"}})
-CUBESTAR = build_serial_stack(load_unit("cubestar"))
+CUBESTAR = SerialStack(load_unit("cubestar"))
 
 SAGITTA = stack_of(
     {

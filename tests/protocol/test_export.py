@@ -31,7 +31,7 @@ from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.names import DEFAULT_UNIT, bundled_units
 from starhil.protocol.quoting import cosmos_state
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.unit_examples import exchanges
 from starhil.protocol.values import Value, to_f32
 
@@ -495,7 +495,7 @@ def test_example_messages_decode_to_the_values_that_are_printed(name: str) -> No
             or exchange.link == "CAN"
         ):
             continue
-        stack = build_serial_stack(icd)
+        stack = SerialStack(icd)
         request = icd.request(row)
         receiver = stack.host()
         receiver.expect(request)
@@ -598,7 +598,7 @@ def test_the_replies_in_the_tables_for_people_are_those_of_the_link(name: str, d
     )
     code = ErrorCode.INVALID_PARAMETER.to_bytes().hex()
     names = {"80": "id", "60": "id", "da": "data", code: "code"}
-    stack = build_serial_stack(load_unit(name))
+    stack = SerialStack(load_unit(name))
     tables = export(load_unit(name), "markdown")
     _, _, *rows = tables[tables.index("| Dialect |") :].split("\n\n")[0].splitlines()
     assert [row.split(" | ")[0] for row in rows] == [f"| {dialect}" for dialect in dialects]

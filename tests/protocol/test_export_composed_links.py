@@ -20,7 +20,7 @@ from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.plugin import Plugin
 from starhil.protocol.serial_stack import SerialStack
 from tests.protocol.c_driver import CDriver, hex_or_none
-from tests.protocol.composed_links import REPLIES, REQUESTS, STACKS
+from tests.protocol.composed_links import REPLIES, REQUESTS, STACKS, definition
 
 
 def python_link(name: str) -> Any:
@@ -197,7 +197,8 @@ def test_the_c_consumes_an_echo_before_the_reply(c: tuple[str, CDriver]) -> None
 def test_code_of_a_plugin_is_rejected(link: dict[str, Any]) -> None:
     model = SerialLinkModel.model_validate({**link, "request_header": [{"role": "id", "type": "u8"}]})
     custom: Any = {"mine": lambda: STACKS["nsp"].requests.framing}
-    stack = SerialStack(model, plugin=Plugin(framings=custom, checks={"mine": lambda _data: b""}))
+    plugin = Plugin(framings=custom, checks={"mine": lambda _data: b""})
+    stack = SerialStack(definition(model.model_dump(exclude_unset=True), plugin=plugin))
     assert isinstance(model.framing, CustomFraming) or isinstance(model.check, CustomCheck)
     with pytest.raises(ProtocolError, match="'mine' is Python code in the unit's plugin"):
         link_text(stack)

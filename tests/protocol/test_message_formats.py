@@ -12,12 +12,12 @@ from starhil.protocol.export.cosmos_plugin import render_folder as cosmos_files
 from starhil.protocol.export.xtce import render as xtce
 from starhil.protocol.icd import load_unit, read_definition
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.values import IcdError
 from tests.protocol.composed_links import TC, TLM, faults, shape, stack_of
 
 ST200 = load_unit("st200")
-STACK = build_serial_stack(ST200)
+STACK = SerialStack(ST200)
 RECORD = ST200.request(ST200.telemetry["record"])
 COMMAND = ST200.request(ST200.telecommands["set_keep_alive"])
 

@@ -11,7 +11,7 @@ from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.names import bundled_units
-from starhil.protocol.serial_stack import SerialStack, build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.values import MessageError
 from tests.protocol.mutations import mutated
 
@@ -44,7 +44,7 @@ def exchanges(icd: InterfaceDefinition, stack: SerialStack) -> tuple[list[bytes]
 @pytest.mark.parametrize("unit", UNITS)
 def test_decoders_survive_mutated_input_and_read_the_next_request(unit):
     icd = load_unit(unit)
-    stack = build_serial_stack(icd)
+    stack = SerialStack(icd)
     requests, replies = exchanges(icd, stack)
     rows = list(icd.rows)
     source = random.Random(SEED)
@@ -83,7 +83,7 @@ def decode(icd: InterfaceDefinition, event: Request | Reply | LinkFault) -> bool
 
 @pytest.mark.parametrize(("unit", "other"), FOREIGN)
 def test_bytes_of_another_unit_are_flagged_and_survived(unit, other):
-    stack, foreign = build_serial_stack(load_unit(unit)), build_serial_stack(load_unit(other))
+    stack, foreign = SerialStack(load_unit(unit)), SerialStack(load_unit(other))
     receiver = stack.device()
     found: list[FaultKind] = []
     for number, sent in enumerate(exchanges(load_unit(other), foreign)[0]):

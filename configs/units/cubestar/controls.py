@@ -9,10 +9,6 @@ from typing import Final
 from starhil.hil_tests.conformance.case import CaseFailed, check_equal
 from starhil.hil_tests.conformance.link_probe import LinkProbe
 
-LINK_PARAMETERS: Final = frozenset(
-    {"serial_dialect", "serial_baud", "can_address", "host_address", "canopen_node"}
-)
-"""Parameters that would disconnect the tester; every case restores their values."""
 SAVE_S: Final = 5.0
 
 
@@ -126,4 +122,4 @@ class CubeStarSettings:
 
 def _read_parameters(probe: LinkProbe) -> dict[str, dict[str, float]]:
     """Read the row of each parameter that the run may change."""
-    return {name: parameter(probe, name) for name in probe.unit.parameters if name not in LINK_PARAMETERS}
+    return {name: parameter(probe, name) for name, item in probe.unit.parameters.items() if not item.of_link}

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from typing import Final
 
 from starhil.configs.units.cubestar.controls import (
-    LINK_PARAMETERS,
     parameter,
     parameters_kept,
     set_parameter,
@@ -102,7 +101,7 @@ def _outside(parameter: Parameter) -> list[float]:
 
 def _inside(parameter: Parameter, present: float) -> list[float]:
     """Yield values that a parameter must accept."""
-    if parameter.name in LINK_PARAMETERS:
+    if parameter.of_link:
         return [present]
     if parameter.enum is not None:
         return [float(number) for number in parameter.enum.values()]

@@ -15,7 +15,7 @@ from starhil.protocol.export.c.composed import link_parts
 from starhil.protocol.export.c.rows import RowCode
 from starhil.protocol.export.templates import fill, text_of
 from starhil.protocol.quoting import Scope, c_comment, identifier
-from starhil.protocol.serial_stack import SerialStack, build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 
 _FUNCTION: Final = re.compile(r"^static .*?\b(\w+)\(", re.MULTILINE)
 
@@ -25,7 +25,7 @@ def render_folder(icd: InterfaceDefinition) -> Mapping[str, str]:
 
     Raises IcdError for a unit without a serial link, or whose link is Python code in a plugin.
     """
-    return files(icd, build_serial_stack(icd))
+    return files(icd, SerialStack(icd))
 
 
 def files(icd: InterfaceDefinition, stack: SerialStack) -> Mapping[str, str]:

@@ -348,8 +348,10 @@ def test_a_session_reports_its_results_to_the_console_as_they_arrive(run):
             )
             begun = await page.message("run")
             assert (begun["title"], begun["planned"], begun["end_s"]) == ("First light", 2, None)
-            feed.result("the device answers", "passed", "ok", identity="1", link="can", seconds=0.1)
-            feed.result("it tracks", "failed", "mode=standby", identity="2", traffic=("-> 1F 7F",))
+            feed.result(
+                id="1", name="the device answers", status="passed", detail="ok", link="can", seconds=0.1
+            )
+            feed.result(id="2", name="it tracks", status="failed", detail="mode=standby", log=("-> 1F 7F",))
             failed = await page.message("result", lambda item: item["result"]["status"] == "failed")
             assert failed["counts"] == {"passed": 1, "failed": 1, "skipped": 0, "not run": 0}
             await asyncio.to_thread(feed.close)

@@ -13,7 +13,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import Failure, FrameRequest, SolverSettings
 from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.pipeline_setup import pipeline_setup
-from starhil.emulator.profile import LINK_PARAMETERS, Profile, load_profile
+from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import bundled_units
@@ -183,7 +183,7 @@ def test_an_extreme_distortion_in_a_profile_is_rejected_or_harmless(term, value)
 def test_an_extreme_default_in_a_profile_is_rejected_or_harmless(make_bench, profile, caplog):
     loaded = load_profile(profile)
     for name, definition in load_unit().device_parameters.items():
-        if name in LINK_PARAMETERS:
+        if definition.profile_key:
             continue  # set in [links]
         for value in extremes(definition):
             parameters = {**loaded.parameters, name: value, "start_mode": "lost_in_space"}

@@ -16,7 +16,7 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.storage import ParameterStorage, StorageError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Request
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from tests.emulator.wire import Wire
 
 NODE = 44
@@ -53,7 +53,7 @@ def test_a_request_in_two_pieces_is_answered(bench):
         uart = Wire()
         link = SerialLink(bench.requests, uart)
         await link.start()
-        data = build_serial_stack(bench.icd).encode_request(Request.of(128))
+        data = SerialStack(bench.icd).encode_request(Request.of(128))
         uart.arrive(data[:2])
         bench.step(0.01)
         uart.arrive(data[2:])

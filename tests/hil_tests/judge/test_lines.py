@@ -20,7 +20,7 @@ from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from starhil.protocol.names import bundled_units
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from tests.conformance.links import LINKS, write_unit
 
 
@@ -56,7 +56,7 @@ def test_rows_have_the_bytes_and_values_of_the_product(name):
 @pytest.mark.parametrize("dialect", ["a", "b", "c"])
 def test_both_sides_of_the_line_agree_with_the_product(name, dialect):
     icd, unit = DEFINITIONS[name]
-    stack, line, rng = build_serial_stack(icd), SerialLine(unit, dialect), random.Random(5)
+    stack, line, rng = SerialStack(icd), SerialLine(unit, dialect), random.Random(5)
     style = None if line.dialect is None else Dialect(line.dialect)
     for row, known in zip(unit.rows, icd.rows, strict=True):
         if row.name in unit.unanswered or row.answers == ("echo",):
@@ -88,7 +88,7 @@ def test_a_changed_byte_is_not_taken_for_the_answer(name):
     icd, unit = DEFINITIONS[name]
     line = SerialLine(unit)
     row = max((item for item in unit.telemetry.values()), key=lambda item: item.size < 40)
-    sent = build_serial_stack(icd).encode_reply(
+    sent = SerialStack(icd).encode_reply(
         Reply(ReplyKind.TELEMETRY, row.id, bytes(range(64, 64 + row.size)), klass=row.klass)
     )
     covered = range(len(sent)) if "header" in unit.serial.check.covers else range(6, len(sent) - 2)
