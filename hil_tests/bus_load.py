@@ -48,8 +48,10 @@ SETTLE_S: Final = 5.0
 # --- the other traffic ---
 
 
-def _send_traffic(spec: str, rate: float, pipe: Connection) -> None:
+def _send_traffic(spec: str, rate: float, pipe: Connection, *, realtime: bool) -> None:
     """Send numbered frames at a rate until stopped; report how many arrived at a second port."""
+    if realtime:
+        set_realtime_priority()
     asyncio.run(_send_traffic_until_stopped(spec, rate, pipe))
 
 
@@ -69,7 +71,6 @@ async def _send_traffic_until_stopped(spec: str, rate: float, pipe: Connection) 
     await listener.start(count)
     await talker.start(lambda _frame: None)
     pipe.send("ready")
-    await asyncio.to_thread(pipe.recv)
     stop = asyncio.create_task(asyncio.to_thread(pipe.recv))
     begin = time.monotonic()
     sent = refused = 0
@@ -96,14 +97,11 @@ class OtherTraffic:
     def __init__(self, spec: str, rate: float, *, realtime: bool = False) -> None:
         self._pipe, far = mp.Pipe()
         self._process = mp.get_context("spawn").Process(
-            target=_send_traffic, args=(spec, rate, far), daemon=True
+            target=_send_traffic, args=(spec, rate, far), kwargs={"realtime": realtime}, daemon=True
         )
         self._process.start()
         far.close()
         self._receive_report()
-        if realtime and self._process.pid is not None:
-            set_realtime_priority(self._process.pid)
-        self._pipe.send("go")
 
     def stop(self) -> tuple[float, int, int, int, int]:
         """End the traffic; return seconds, and frames sent, lost, out of order, and rejected by the port."""

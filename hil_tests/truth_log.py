@@ -38,15 +38,14 @@ class TruthLogReader:
         Raises BenchError: the file cannot be read, lacks a column, or does not cover the time.
         """
         if not self._covers(time_s):
-            self._read()
+            self.check()
         if not self._covers(time_s):
             span = f"{self._times[0]:.3f} to {self._times[-1]:.3f} s" if self._times else "nothing"
             raise BenchError(f"{self._path}: has no truth for the time {time_s:.3f} s; it covers {span}")
+        time_s = min(max(time_s, self._times[0]), self._times[-1])
         after = bisect.bisect_left(self._times, time_s)
         if after == 0:
             return self._attitudes[0]
-        if after == len(self._times):
-            return self._attitudes[-1]
         begin, end = self._times[after - 1], self._times[after]
         return interpolate(
             self._attitudes[after - 1], self._attitudes[after], (time_s - begin) / (end - begin)
@@ -57,19 +56,16 @@ class TruthLogReader:
 
         Raises BenchError: the file cannot be read, lacks a column, or has no line yet.
         """
-        self._read()
+        self.check()
         if self._last is None:
             raise BenchError(f"{self._path}: has no truth yet")
         return self._last
 
-    def check(self) -> None:
-        """Raise BenchError if the file cannot be read or lacks a column; it may have no line yet."""
-        self._read()
-
     def _covers(self, time_s: float) -> bool:
         return bool(self._times) and self._times[0] - SLACK_S <= time_s <= self._times[-1] + SLACK_S
 
-    def _read(self) -> None:
+    def check(self) -> None:
+        """Read the file; raise BenchError if it cannot be read or lacks a column. It may have no line yet."""
         try:
             text = read_user_text(self._path, MAX_BYTES)
         except OSError as error:

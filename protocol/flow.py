@@ -94,10 +94,8 @@ class TurnProtocol(asyncio.BufferedProtocol):
 
 def limit_buffers(transport: asyncio.BaseTransport) -> None:
     """Limit the kernel buffers of a TCP connection, which hold megabytes by default."""
-    connection = _tcp_socket(transport)
-    if connection is not None:
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WINDOW)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, WINDOW)
+    for option in (socket.SO_SNDBUF, socket.SO_RCVBUF):
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, option, WINDOW)
 
 
 def detect_lost_peer(transport: asyncio.BaseTransport, *, must_read: bool = False) -> None:
@@ -106,19 +104,11 @@ def detect_lost_peer(transport: asyncio.BaseTransport, *, must_read: bool = Fals
     With `must_read`, a peer that is alive but reads nothing for that long is lost too. Use it for servers,
     but not for clients, which may be halted in a debugger.
     """
-    connection = _tcp_socket(transport)
-    if connection is None:
-        return
+    connection = transport.get_extra_info("socket")
     options = KEEPALIVE | {socket.TCP_USER_TIMEOUT: UNREAD_LIMIT_MS} if must_read else KEEPALIVE
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in options.items():
         connection.setsockopt(socket.IPPROTO_TCP, option, value)
-
-
-def _tcp_socket(transport: asyncio.BaseTransport) -> socket.socket | None:
-    connection: socket.socket | None = transport.get_extra_info("socket")
-    is_tcp = connection is not None and connection.family in (socket.AF_INET, socket.AF_INET6)
-    return connection if is_tcp else None
 
 
 class FairQueue:

@@ -144,7 +144,7 @@ def live_from_seed(unit: str, seed: int, steps: int, kind: str, folder: Path) ->
 
 def live(unit: str, life: Any, *, rendered: bool, folder: Path) -> dict[str, Any]:
     """Live a life; if it ends in a violation, shorten it and write it to the folder."""
-    from starhil.hil_tests.endurance.shrink import kind_of, shortened
+    from starhil.hil_tests.endurance.violating_life import kind_of, shortened
 
     logging.getLogger("starhil").addHandler(logging.NullHandler())
     logging.getLogger("starhil").propagate = False
@@ -202,7 +202,7 @@ def run_once(life: Any, *, rendered: bool = False, record: Path | None = None) -
 def write_life(life: Any, violation: str, folder: Path) -> list[Path]:
     """Write a life as JSON, as a session, and as the recording of its last time under power, if that can be repeated."""
     from starhil.hil_tests.endurance.life import UNRECORDED
-    from starhil.hil_tests.endurance.session_text import session_of
+    from starhil.hil_tests.endurance.violating_life import session_of
     from starhil.hil_tests.judge.definition import read_unit
 
     name = f"{Path(life.unit).name}-{life.seed}"

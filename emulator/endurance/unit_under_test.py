@@ -35,6 +35,10 @@ from starhil.protocol.transports.paced import SerialTransport
 
 Item = TypeVar("Item", bytes, CanFrame)
 
+QUEUE_LIMIT: Final = 5000
+DESCRIPTOR_LIMIT: Final = 4
+MEMORY_LIMIT_BYTES: Final = 64 * 2**20
+"""A life may queue so many events, and add so many descriptors and bytes to those in use after its first power-on."""
 STATE_FOLDER: Final = "state"
 LONGEST_START_S: Final = 120.0
 """Longest wall time for which a killed pipeline may take to be missed, or to be ready again, seconds."""
@@ -160,6 +164,8 @@ class UnitUnderTest:
         """Number of images solved in all, and the sum of their periods, seconds."""
         self._unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
         self._transports: dict[str, MemoryTransport[Any]] = {}
+        self._first: tuple[int, int] | None = None
+        """Descriptors and memory, bytes, in use when power was first on."""
         self._errors = _InternalErrors()
         logging.getLogger("starhil.internal").addHandler(self._errors)
 
@@ -195,6 +201,7 @@ class UnitUnderTest:
         await self._emulator.start()
         self.head.device.signals.frame_published.connect(self._count_frame)
         await self._emulator.ready()
+        self._first = self._first or (self.open_descriptors(), self.memory_bytes())
 
     async def power_off(self, *, factory: bool = False) -> None:
         """Switch the unit off; `factory` deletes its stored state."""
@@ -289,10 +296,17 @@ class UnitUnderTest:
 
     # --- what the bus does not show ---
 
-    def internal_errors(self) -> list[str]:
-        """Return the internal errors logged since the last call."""
-        found, self._errors.texts = self._errors.texts, []
-        return found
+    def defect(self) -> str:
+        """Return an internal error that was logged, or what has grown since power was first switched on; empty if nothing."""
+        if self._errors.texts:
+            return f"internal error: {self._errors.texts[0]}"
+        if (queued := self.queued_events()) > QUEUE_LIMIT:
+            return f"{queued} events are queued"
+        descriptors, memory_bytes = self._first or (0, 0)
+        if (found := self.open_descriptors()) > descriptors + DESCRIPTOR_LIMIT:
+            return f"{found} descriptors are open, {descriptors} at the start"
+        added = self.memory_bytes() - memory_bytes
+        return f"{added >> 20} MiB of memory more than at the start" if added > MEMORY_LIMIT_BYTES else ""
 
     def open_descriptors(self) -> int:
         """Return the number of open file descriptors of this process."""

@@ -44,7 +44,7 @@ def defaults(probe: CanopenProbe) -> None:
     """Checks integers of the communication profile, after `load` has cleared stored parameters."""
     if 0x1011 in probe.od:
         probe.set(0x1011, 1, b"load")
-    probe.reset_communication()
+    probe.reset_to_stored_values()
     for item in probe.variables():
         wanted = is_integer(item) and item.default is not None and item.readable
         if not wanted or item.index >= 0x2000 or item.index in {0x1001, 0x1003, 0x1013}:

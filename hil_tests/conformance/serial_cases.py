@@ -304,7 +304,7 @@ def _silent_header(envelope: Headed, name: str, item: Any, values: list[int], wh
         header = _body(probe)[: envelope.requests.size(klass)]
         offset, size = envelope.requests.place(item, klass)
         for value in values:
-            piece = value.to_bytes(size, item.order or probe.unit.byte_order)
+            piece = value.to_bytes(size, item.order or probe.unit.conventions.byte_order)
             changed = header[:offset] + piece + header[offset + size :]
             probe.send(probe.line.request_format(klass)[0].encode(envelope.closed(changed, b"")))
         probe.expect_silence(what)

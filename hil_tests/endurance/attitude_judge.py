@@ -43,8 +43,10 @@ SMALLEST_SCALAR: Final = 0.1
 """Smallest scalar that is computed from the other three numbers of a quaternion."""
 ARCSEC: Final = 1.0 / ARCSEC_PER_RAD
 
-Readings = Mapping[str, tuple[Field, Value]]
+Readings = dict[str, tuple[Field, Value]]
 """Field and value of each quantity of a row."""
+Stated = tuple[Quaternion, float]
+"""Attitude that a row states, from ICRS to the sensor as mounted, and the tolerance of its numbers, rad."""
 
 
 @dataclass(frozen=True)
@@ -84,34 +86,35 @@ class Motion:
 class AttitudeJudge:
     """Judges attitudes, reported in `conventions`, by the motion of the sensor and the parameters in use.
 
-    `sigma_arcsec` are the largest standard deviations across and about the boresight that the unit may leave unstated; `count` valid
+    `values` are these parameters, which the oracle keeps up to date; `sigma_arcsec` are the largest standard deviations across and about the boresight that the unit may leave unstated; `count` valid
     attitudes were compared with the truth, which follows the `motions` in the order of their start; no light has reached the
     detector since `dark_since_s`, None: it does.
     """
 
-    def __init__(self, conventions: Conventions, sigma_arcsec: tuple[float, float]) -> None:
+    def __init__(
+        self,
+        conventions: Conventions,
+        values: Mapping[str, Known | None],
+        sigma_arcsec: tuple[float, float],
+    ) -> None:
         self._conventions = conventions
+        self._values = values
         self._sigma_arcsec = sigma_arcsec
         self.count = 0
         self.motions: list[Motion] = []
         self.dark_since_s: float | None = None
         self._periods: list[tuple[float, float]] = []
 
-    def started(self, now_s: float, values: Mapping[str, Known | None]) -> None:
-        """The unit has started with these parameters."""
-        self._periods = [(now_s, period_s(values))]
+    def started(self, now_s: float) -> None:
+        """The unit has started."""
+        self._periods = [(now_s, self._period_s())]
 
-    def retimed(self, now_s: float, values: Mapping[str, Known | None]) -> None:
+    def retimed(self, now_s: float) -> None:
         """Parameters that set the period of the exposures may have changed."""
-        self._periods = [*self._periods[-KEPT_PERIODS:], (now_s, period_s(values))]
+        self._periods = [*self._periods[-KEPT_PERIODS:], (now_s, self._period_s())]
 
-    def judge(
-        self, row: str, read: Readings, now_s: float, values: Mapping[str, Known | None], *, imaging: bool
-    ) -> None:
-        """Judge the attitude in a row, read at a simulation time in seconds with these parameters in use.
-
-        `imaging`: whether the unit may be in a mode with frames.
-        """
+    def judge(self, row: str, read: Readings, now_s: float, *, imaging: bool) -> None:
+        """Judge the attitude in a row, read at a simulation time; `imaging`: the unit may be in a mode with frames."""
         reported = [read[name] for name in (f"attitude.{letter}" for letter in "xyzw") if name in read]
         numbers = [float(value) for _, value in reported if not isinstance(value, (str, bytes))]
         stars = _stars(read)
@@ -125,70 +128,58 @@ class AttitudeJudge:
             return
         if not imaging:
             raise Violation(f"{row}: a valid attitude in a mode without images")
-        window_s = self._window_s(now_s, values)
+        window_s = _window_of(max(self._recent_periods(now_s)))
         dark_s = math.inf if self.dark_since_s is None else self.dark_since_s
         if now_s > dark_s + window_s - STALE_S:
             raise Violation(f"{row}: a valid attitude {now_s - dark_s:.3f} s after the lens was covered")
-        if not math.isfinite(window_s):
-            return
-        if len(numbers) >= 3:
-            finest = max(field.resolution for field, _ in reported) + 1e-7
-            self._judge_quaternion(row, numbers, 4.0 * finest, read, (now_s, window_s), values)
-        if len(stars) >= 2:
-            self._judge_stars(row, stars, (now_s, window_s), values)
+        if math.isfinite(window_s):
+            finest = max((field.resolution for field, _ in reported), default=0.0) + 1e-7
+            self._compare(row, self._of_quaternion(row, numbers, 4.0 * finest), read, now_s, window_s)
+            self._compare(row, self._of_stars(row, stars), {}, now_s, window_s)
 
-    def _judge_quaternion(
-        self,
-        row: str,
-        numbers: list[float],
-        tolerance: float,
-        read: Readings,
-        window: tuple[float, float],
-        values: Mapping[str, Known | None],
-    ) -> None:
-        """Judge a quaternion, whose scalar may be left out if its sign is fixed."""
+    def _of_quaternion(self, row: str, numbers: list[float], tolerance: float) -> Stated | None:
+        """Return the attitude of a quaternion, whose scalar may be left out if its sign is fixed."""
         if len(numbers) == 3:
             scalar = math.sqrt(max(0.0, 1.0 - sum(number * number for number in numbers)))
             if self._conventions.scalar_sign != "positive" or scalar < SMALLEST_SCALAR:
-                return
+                return None
             tolerance /= scalar
             numbers = [*numbers, scalar]
+        if len(numbers) != 4:
+            return None
         length = math.sqrt(sum(number * number for number in numbers))
         if abs(length - 1.0) > tolerance:
             raise Violation(f"{row}: the quaternion has length {length!r}")
-        q = Quaternion(*(number / length for number in numbers))
-        measured = self._without_mounting(from_reported(q, self._conventions), values)
-        if measured is not None:
-            self.count += 1
-            self._check_error(row, self._errors(measured, *window), read, tolerance)
+        return from_reported(
+            Quaternion(*(number / length for number in numbers)), self._conventions
+        ), tolerance
 
-    def _judge_stars(
-        self,
-        row: str,
-        stars: list[tuple[Vector, Vector, float]],
-        window: tuple[float, float],
-        values: Mapping[str, Known | None],
-    ) -> None:
-        """Judge measured directions of stars by the attitude in which they have their catalogue directions."""
+    def _of_stars(self, row: str, stars: list[tuple[Vector, Vector, float]]) -> Stated | None:
+        """Return the attitude in which the measured directions of stars have their catalogue directions."""
+        if len(stars) < 2:
+            return None
         (one, one_icrs, step), (other, other_icrs, _) = stars[:2]
         apart = math.hypot(*cross(one, other))
-        error = math.hypot(*(a - b for a, b in zip(one, other, strict=True)))
-        error -= math.hypot(*(a - b for a, b in zip(one_icrs, other_icrs, strict=True)))
+        error = math.dist(one, other) - math.dist(one_icrs, other_icrs)
         star_rad = SIGMAS * self._sigma_arcsec[0] * ARCSEC + 2.0 * step
         if abs(error) > 2.0 * star_rad:
             raise Violation(
                 f"{row}: two stars are {abs(error) / ARCSEC:.1f} arcsec too near or too far apart"
             )
         if apart < 10.0 * star_rad:
-            return
-        reported = from_directions((one, other), (one_icrs, other_icrs))
+            return None
+        turned = from_directions((one, other), (one_icrs, other_icrs))
         axes = from_matrix(self._conventions.rows)
-        measured = self._without_mounting(product(conjugate(axes), reported), values)
-        if measured is None:
-            return
-        self.count += 1
-        tolerance = star_rad * (1.0 + 1.0 / apart)
-        self._check_error(row, self._errors(measured, *window), {}, tolerance)
+        return product(conjugate(axes), turned), star_rad * (1.0 + 1.0 / apart)
+
+    def _compare(
+        self, row: str, stated: Stated | None, read: Readings, now_s: float, window_s: float
+    ) -> None:
+        """Compare an attitude with the truth at the times at which the exposure may have been."""
+        measured = None if stated is None else self._without_mounting(stated[0])
+        if stated is not None and measured is not None:
+            self.count += 1
+            self._check_error(row, self._errors(measured, now_s, window_s), read, stated[1])
 
     def _check_error(self, row: str, errors: Sequence[Vector], read: Readings, tolerance_rad: float) -> None:
         """Check the errors to the truth against what is stated, or else the largest that may be left unstated."""
@@ -225,55 +216,47 @@ class AttitudeJudge:
                 errors.append(motion.error(measured, mid_s, slack_s))
         return errors
 
-    def _without_mounting(
-        self, attitude: Quaternion, values: Mapping[str, Known | None]
-    ) -> Quaternion | None:
+    def _without_mounting(self, attitude: Quaternion) -> Quaternion | None:
         """Return an attitude of the mounted sensor in its own frame; None if the mounting is not known."""
         for axis in reversed(range(3)):
-            angle = values[f"mounting_{MOUNTING[axis]}"]
+            angle = self._values[f"mounting_{MOUNTING[axis]}"]
             if angle is None:
                 return None
             turn = [math.radians(float(angle[0])) if index == axis else 0.0 for index in range(3)]
             attitude = product(from_rotation_vector(turn), attitude)
         return attitude
 
-    def check_period(
-        self, where: str, field: Field, value: Value, now_s: float, values: Mapping[str, Known | None]
-    ) -> None:
+    def check_period(self, where: str, field: Field, value: Value, now_s: float) -> None:
         """Check the time between exposures, which changes with the next image after a telecommand."""
         low, high = field.limits
         scale = factor("s", field.unit) or 1.0
-        recent = self._recent_periods(now_s, values)
+        recent = self._recent_periods(now_s)
         if isinstance(value, (str, bytes)) or not all(map(math.isfinite, recent)):
             return
         possible = [min(max(period * scale, low), high) for period in recent]
         if all(abs(value - period) > field.resolution + 1e-6 * period for period in possible):
             raise Violation(f"{where}: {value!r}, not {possible[0]!r}")
 
-    def _recent_periods(self, now_s: float, values: Mapping[str, Known | None]) -> list[float]:
+    def _recent_periods(self, now_s: float) -> list[float]:
         """Return the periods in use when the last image may have been taken; infinite if not known."""
-        recent = [period_s(values)]
+        recent = [self._period_s()]
         for number, (_, period) in enumerate(self._periods):
             until_s = self._periods[number + 1][0] if number + 1 < len(self._periods) else now_s
             if now_s - until_s <= _window_of(min(period, LONGEST_PERIOD_S)):
                 recent.append(period)
         return recent
 
-    def _window_s(self, now_s: float, values: Mapping[str, Known | None]) -> float:
-        """Return the largest age that a valid attitude may have now; infinite if it is not known."""
-        return _window_of(max(self._recent_periods(now_s, values)))
+    def _period_s(self) -> float:
+        """Return the time between exposures; infinite if it is not known."""
+        rate, exposure, delay = (self._values[name] for name in ("update_rate", "exposure", "delay_time"))
+        if rate is None or exposure is None or delay is None:
+            return math.inf
+        return max(1.0 / float(rate[0]), (float(exposure[0]) + float(delay[0])) / 1000.0)
 
 
 def _window_of(period: float) -> float:
+    """Return the largest age that a valid attitude may have."""
     return (STALE_PERIODS + 1) * period + STALE_S + PROCESSING_S
-
-
-def period_s(values: Mapping[str, Known | None]) -> float:
-    """Return the time between exposures with these parameters; infinite if they are not known."""
-    rate, exposure, delay = (values.get(name) for name in ("update_rate", "exposure", "delay_time"))
-    if rate is None or exposure is None or delay is None:
-        return math.inf
-    return max(1.0 / float(rate[0]), (float(exposure[0]) + float(delay[0])) / 1000.0)
 
 
 def _stars(read: Readings) -> list[tuple[Vector, Vector, float]]:

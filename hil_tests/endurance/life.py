@@ -372,30 +372,7 @@ class LifeGenerator:
                 return min(max(default, low), high)
             if isinstance(default, str) and default in (field.enum or {}):
                 return default
-        match field.kind:
-            case "flag":
-                return self._random.random() < 0.5
-            case "bytes":
-                return self._random.randbytes(field.size)
-            case "text":
-                return "x" * self._random.randint(0, field.size)
-            case "enum":
-                return self._random.choice(list(field.enum or ()))
-            case "float":
-                low, high = field.limits
-                edges = [low, high, 0.0, 1.0]
-                finite = [edge for edge in edges if low <= edge <= high and abs(edge) < 1e30]
-                if finite and (chance > 0.9 or high - low > 1e9):
-                    return self._random.choice(finite)
-                return self._random.uniform(low, high)
-            case _:
-                low_raw, high_raw = field.raw_limits
-                raw = (
-                    self._random.choice((low_raw, high_raw))
-                    if chance > 0.9
-                    else self._random.randint(low_raw, high_raw)
-                )
-                return field.physical(raw)
+        return field.random_value(self._random, at_limit=chance > 0.9)
 
     # --- invalid input ---
 

@@ -11,12 +11,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final
 
+from starhil.hil_tests.endurance.attitude_judge import Readings
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge import canopen
 from starhil.hil_tests.judge.definition import Unit
-from starhil.hil_tests.judge.messages import Value
-from starhil.hil_tests.judge.rows import Field
 from starhil.protocol.can_framing import CanFrame
 
 DEVICE_ERROR: Final = 0xFF00
@@ -25,8 +24,6 @@ STATES: Final = frozenset({0x00, 0x04, 0x05, 0x7F})
 """States in a heartbeat: boot-up, stopped, operational, pre-operational."""
 TPDO: Final = 0x1800
 """Index of the communication record of the first TPDO."""
-
-Readings = dict[str, tuple[Field, Value]]
 
 
 class Node:

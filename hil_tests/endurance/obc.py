@@ -7,7 +7,7 @@ What comes without a request is heard at the end of each step, in the order of i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -20,7 +20,6 @@ from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request, Value
 from starhil.hil_tests.judge.rows import Row
-from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
 
 TIME_OUT_S: Final = 0.7
@@ -39,7 +38,6 @@ class Obc:
         self._outcome = outcome
         serial = definition.serial
         self._fixed_framing = serial is not None and serial.framing.kind == "fixed"
-        self._line = None if serial is None else SerialLine(definition)
         self._objects = {} if definition.canopen is None else objects_of(definition)
         self._node = None if definition.canopen is None else Node(definition)
         self._ports: dict[str, Port] = {}
@@ -131,25 +129,24 @@ class Obc:
 
     async def request(self, link: str, row: Sequence[Any], data: str = "") -> None:
         """Send a request, data in hexadecimal, and judge the answers."""
-        await self._request(link, row, bytes.fromhex(data))
-
-    async def _request(self, link: str, key: Sequence[Any], data: bytes) -> None:
-        klass, row_id, kind = key
-        row = self._definition.by_key.get((klass, row_id))
-        if row is not None and row.kind != kind:
-            row = None
-        if link == "canopen" and not self._in_dictionary(row, data):
+        klass, row_id, kind = row
+        request = Request(row_id, bytes.fromhex(data), klass, telemetry=kind == "telemetry")
+        known = self._definition.by_key.get((klass, row_id))
+        if known is not None and known.kind != kind:
+            known = None
+        if link == "canopen" and not self._in_dictionary(known, request):
             return
-        verdict = self._oracle.verdict(row, kind, data)
-        request = Request(row_id, data, klass, telemetry=kind == "telemetry")
+        verdict = self._oracle.verdict(known, request)
         try:
             self._ports[link].ask(request)
         except (ValueError, OverflowError):
             return  # the header has no room for such an ID
         self._outcome.requests += 1
-        counts = link != "canopen" or (kind == "telecommand" and not self._oracle.is_outside(row, data))
+        counts = link != "canopen" or not (
+            request.telemetry or known is None or self._oracle.is_outside(known, request.data)
+        )
         if counts and not self._oracle.stuck:
-            self._oracle.counted(kind)
+            self._oracle.counted(request)
         answers = self._answers(link)
         if self._oracle.stuck:
             if answers:
@@ -158,11 +155,11 @@ class Obc:
         elif link in self._oracle.disturbed:
             await self._unknown_outcome(link, request)
         else:
-            await self._judge(link, row, request, verdict, answers, counts=counts)
+            await self._judge(link, known, request, verdict, answers, counts=counts)
 
-    def _in_dictionary(self, row: Row | None, data: bytes) -> bool:
+    def _in_dictionary(self, row: Row | None, request: Request) -> bool:
         """Return whether a request can be made by SDO."""
-        if row is None or len(data) != (row.size if row.kind == "telecommand" else 0):
+        if row is None or len(request.data) != (0 if row.is_telemetry else row.size):
             return False
         return (row.kind, row.name) in self._objects
 
@@ -196,30 +193,18 @@ class Obc:
         counts: bool,
     ) -> None:
         what = f"{link}: {row.name if row is not None else request.id}"
-        sent = f"{what} {request.data.hex()}".rstrip()
+        for fault in self._faults(link, row, request, verdict, replies):
+            raise Violation(f"{f'{what} {request.data.hex()}'.rstrip()}: {fault}")
         expected = self._expected_answers(link, row)
-        self._check_form(sent, replies)
-        nack = next((reply for reply in replies if reply.kind == "nack"), None)
-        silent = not replies or tuple(expected) == ("echo",)
-        if nack is not None:
-            self._judge_refusal(sent, link, nack, verdict)
-            if len(replies) != 1:
-                raise Violation(f"{sent}: {len(replies)} answers to a refused request")
-        elif silent:
-            if expected and not replies:
-                self._judge_silence(sent, verdict, refusable=self._can_refuse(link, request.klass))
-            if verdict is None and expected:
-                await self._unknown_outcome(link, request)
-                return
-        elif verdict not in (None, "ok"):
-            self._judge_acceptance(sent, link, row)
-        elif sum(reply.final for reply in replies) != 1:
-            raise Violation(f"{sent}: {sum(reply.final for reply in replies)} answers")
+        refused = any(reply.kind == "nack" for reply in replies)
+        silent = not refused and (not replies or expected == ("echo",))
+        if silent and verdict is None and expected:
+            await self._unknown_outcome(link, request)
+            return
         if counts and not request.telemetry:
-            refused_code = "internal" if nack is not None else "ok"
-            sure = verdict is not None or not (nack or silent)
-            await self._executed(row, request, verdict or refused_code, sure=sure)
-        if silent and nack is None and verdict != "ok":
+            sure = verdict is not None or not (refused or silent)
+            await self._executed(row, request, verdict or ("internal" if refused else "ok"), sure=sure)
+        if silent and verdict != "ok":
             await self.settle(link)
             if self._fixed_framing:
                 self._oracle.forget()
@@ -227,38 +212,48 @@ class Obc:
             if reply.kind == "telemetry" and verdict in (None, "ok"):
                 self._read(what, row, request, reply)
 
-    def _check_form(self, sent: str, replies: list[Answer]) -> None:
-        for reply in replies:
-            if reply.kind == "malformed":
-                raise Violation(f"{sent}: {reply}")
+    def _faults(
+        self, link: str, row: Row | None, request: Request, verdict: str | None, replies: list[Answer]
+    ) -> Iterator[str]:
+        """Yield what is wrong with the answers to a request."""
+        port, expected = self._ports[link], self._expected_answers(link, row)
+        line = port.line if isinstance(port, SerialPort) else None
+        yield from (str(reply) for reply in replies if reply.kind == "malformed")
+        nack = next((reply for reply in replies if reply.kind == "nack"), None)
+        if nack is not None:
+            if verdict == "ok":
+                yield f"refused with {nack.code}, must be accepted"
+            elif verdict is not None and not self._is_code(nack.code, verdict, port):
+                yield f"refused with {nack.code}, not {self._definition.code(verdict)}"
+            if len(replies) != 1:
+                yield f"{len(replies)} answers to a refused request"
+        elif not replies:
+            if expected and verdict == "ok":
+                yield "no answer"
+            refusable = (line is None or line.envelope.can_refuse(request.klass)) and not self._fixed_framing
+            if expected and verdict is not None and refusable:
+                yield "no answer, must be refused"
+        elif expected != ("echo",) and verdict not in (None, "ok"):
+            # in dialects a and b, data and the code of a refusal may both be one byte
+            if line is None or line.dialect not in ("a", "b") or row is None or row.size != 1:
+                yield "accepted, must be refused"
+        elif expected != ("echo",) and sum(reply.final for reply in replies) != 1:
+            yield f"{sum(reply.final for reply in replies)} answers"
 
     def _expected_answers(self, link: str, row: Row | None) -> Sequence[str]:
         if row is None:
             return ("reply",)
-        return () if link == "serial" and row.name in self._definition.unanswered else row.answers
+        return tuple(self._definition.serial_answers(row) if link == "serial" else row.answers)
 
-    def _judge_silence(self, sent: str, verdict: str | None, *, refusable: bool) -> None:
-        if verdict == "ok":
-            raise Violation(f"{sent}: no answer")
-        if verdict is not None and refusable and not self._fixed_framing:
-            raise Violation(f"{sent}: no answer, must be refused")
-
-    def _judge_acceptance(self, sent: str, link: str, row: Row | None) -> None:
-        """Judge data in answer to what must be refused; in dialects a and b, both may be one byte."""
-        port = self._ports[link]
-        ambiguous = isinstance(port, SerialPort) and port.dialect in ("a", "b")
-        if row is None or row.size != 1 or not ambiguous:
-            raise Violation(f"{sent}: accepted, must be refused")
-
-    def _judge_refusal(self, sent: str, link: str, nack: Answer, verdict: str | None) -> None:
-        if verdict == "ok":
-            raise Violation(f"{sent}: refused with {nack.code}, must be accepted")
-        if verdict is not None and not self._same_code(link, nack, verdict):
-            raise Violation(f"{sent}: refused with {nack.code}, not {self._definition.code(verdict)}")
+    def _is_code(self, code: int, error: str, port: Port) -> bool:
+        """Return whether a refusal has the code of an error; aborts have codes of their own, some lines have none."""
+        if isinstance(port, SerialPort) and not port.line.envelope.has_codes:
+            return True
+        return code != 0 if isinstance(port, CanopenPort) else code == self._definition.code(error)
 
     async def _executed(self, row: Row | None, request: Request, code: str, *, sure: bool) -> None:
         oracle = self._oracle
-        oracle.executed(row, request.id, request.data, code, sure=sure)
+        oracle.executed(row, request, code, sure=sure)
         if row is None or code != "ok":
             return
         if row.action == "reset":
@@ -282,16 +277,6 @@ class Obc:
         self._outcome.readings += 1
         self._oracle.read(other, reply.data)
 
-    def _same_code(self, link: str, nack: Answer, verdict: str) -> bool:
-        if link == "serial" and self._line is not None and not self._line.envelope.has_codes:
-            return True
-        if link == "canopen":
-            return nack.code != 0  # aborts have codes of their own
-        return nack.code == self._definition.code(verdict)
-
-    def _can_refuse(self, link: str, klass: str) -> bool:
-        return link != "serial" or self._line is None or self._line.envelope.can_refuse(klass)
-
     # --- many requests, parts of requests, and other input ---
 
     async def burst(self, link: str, rows: Sequence[Sequence[Any]]) -> None:
@@ -299,33 +284,32 @@ class Obc:
         if link == "canopen" or self._oracle.stuck or link in self._oracle.disturbed:
             return
         known = [self._definition.by_key[klass, row_id] for klass, row_id, _ in rows]
-        asked = [row for row in known if self._oracle.verdict(row, "telemetry", b"") == "ok"]
+        asked = [row for row in known if self._oracle.verdict(row, self._definition.request(row)) == "ok"]
         self._outcome.requests += len(asked)
-        self._ports[link].ask(*(Request(row.id, klass=row.klass, telemetry=True) for row in asked))
+        self._ports[link].ask(*(self._definition.request(row) for row in asked))
         replies = self._answers(link)
         if len(replies) != len(asked) or any(reply.kind != "telemetry" for reply in replies):
             raise Violation(f"{link}: {len(replies)} answers to {len(asked)} requests")
         for row, reply in zip(asked, replies, strict=True):
-            self._oracle.counted("telemetry")
+            self._oracle.counted(self._definition.request(row))
             if reply.row_id not in (None, row.id) or len(reply.data) != row.size:
                 raise Violation(f"{link}: {reply} where {row.name} was next")
             self._oracle.read(row, reply.data)
 
     async def flood(self, link: str, row: Sequence[Any], count: int, data: str = "") -> None:
         """Send the same request many times, each judged, so that counters of 16 bits wrap."""
-        content = bytes.fromhex(data)
         for _ in range(count):
             if self._oracle.stuck or link in self._oracle.disturbed:
                 return
-            await self._request(link, row, content)
+            await self.request(link, row, data)
 
     async def cut(self, link: str, row: Sequence[Any], share: float) -> None:
         """Send the first part of a request, as a client that goes away, which a bus must not see answered."""
         if link in self._oracle.disturbed:
             return
         known = self._definition.by_key[row[0], row[1]]
-        content = bytes(known.size) if known.kind == "telecommand" else b""
-        self._ports[link].cut(Request(known.id, content, known.klass, known.kind == "telemetry"), share)
+        content = b"" if known.is_telemetry else bytes(known.size)
+        self._ports[link].cut(self._definition.request(known, content), share)
         if link != "serial":
             await self.pass_time(TIME_OUT_S)
             return
@@ -356,9 +340,10 @@ class Obc:
     async def expect_valid(self, row: Row, field: str, recovery_s: float) -> None:
         """Read a row, whose attitude must be valid."""
         link = self._unit.links[0]
-        self._ports[link].ask(Request(row.id, klass=row.klass, telemetry=True))
+        request = self._definition.request(row)
+        self._ports[link].ask(request)
         if link != "canopen":
-            self._oracle.counted("telemetry")
+            self._oracle.counted(request)
         replies = [answer for answer in self._answers(link) if answer.kind == "telemetry"]
         if not replies:
             raise Violation(f"{link}: {row.name}: no answer after all faults have ended")

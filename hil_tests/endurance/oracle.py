@@ -13,10 +13,10 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
-from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge, Motion
+from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge, Motion, Readings
 from starhil.hil_tests.endurance.violation import Known, Violation
 from starhil.hil_tests.judge.definition import Unit
-from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.messages import Request, Value
 from starhil.hil_tests.judge.rows import PARAMETER, Field, Row
 from starhil.protocol.units_of_measure import factor
 
@@ -57,7 +57,7 @@ class Oracle:
         self.modes: set[str] = {"boot"}
         self.counts: dict[str, int | None] = {}
         self._boot_count: int | None = None
-        self.attitudes: Final = AttitudeJudge(definition.conventions, sigma_arcsec)
+        self.attitudes: Final = AttitudeJudge(definition.conventions, self.values, sigma_arcsec)
         self.disk_full = False
         self.stuck = False
         self.disturbed: set[str] = set()
@@ -72,11 +72,13 @@ class Oracle:
             "mode": self._check_mode,
             "error.active": self._check_in_error,
             "frame.counter": self._check_frames,
-            "frame.period": self._check_period,
+            "frame.period": lambda where, field, value: self.attitudes.check_period(
+                where, field, value, self.now_s
+            ),
             "request.error": self._check_error,
             **{name: partial(self._check_fraction, name) for name in _FRACTIONS},
         }
-        self._start(0.0)
+        self.restarted(0.0)
 
     # --- what happens to the unit ---
 
@@ -89,15 +91,12 @@ class Oracle:
         self.disturbed.clear()
         self.attitudes.dark_since_s = None
         self.attitudes.motions = [motion]
-        self._start(0.0)
+        self.restarted(0.0)
 
     def restarted(self, at_s: float) -> None:
-        """The unit has restarted by itself at a time."""
-        self._start(at_s)
-
-    def _start(self, at_s: float) -> None:
+        """The unit has started at a time: at power-on, or again by itself."""
         self._started_s: float | None = at_s
-        self.values = {**self._defaults, **self._stored}
+        self.values.update({**self._defaults, **self._stored})
         self._at_start = {name: self.values[name] for name in AT_START}
         self.modes = {"boot"}
         self.counts = {"telecommands": 0, "telemetry": 0}
@@ -110,7 +109,7 @@ class Oracle:
         self._selected = next(iter(self._definition.parameters_by_id), None)
         self._last = None
         self.bursts = self._subscribed = False
-        self.attitudes.started(at_s, self.values)
+        self.attitudes.started(at_s)
 
     def time_passed(self, now_s: float) -> None:
         """Simulation time has passed."""
@@ -142,14 +141,14 @@ class Oracle:
 
     def forget(self) -> None:
         """Nothing is known of parameters and counters any more, because a request had an unknown outcome."""
-        self.values = dict.fromkeys(self.values)
+        self.values.update(dict.fromkeys(self.values))
         self._at_start = dict.fromkeys(AT_START)
         self._stored = dict.fromkeys(self.values)
         self.counts = dict.fromkeys(self.counts)
         self._clock = self._boot_count = self._selected = self._last = self._started_s = None
         self.modes = {"boot", "standby", "error", *IMAGING}
         self.bursts = self._subscribed = True
-        self.attitudes.retimed(self.now_s, self.values)
+        self.attitudes.retimed(self.now_s)
 
     def in_use(self, name: str) -> Value | None:
         """Return the value of a parameter that the unit works with, None if it is not known."""
@@ -158,11 +157,12 @@ class Oracle:
 
     # --- requests ---
 
-    def verdict(self, row: Row | None, kind: str, data: bytes) -> str | None:
+    def verdict(self, row: Row | None, request: Request) -> str | None:
         """Return "ok" if a request must be accepted, the error with which it must be refused, or None: either."""
+        data = request.data
         if row is None:
             return "invalid_id"
-        if kind == "telemetry":
+        if request.telemetry:
             images = any((field.value or "").startswith(("image.", "file.")) for field in row.named.values())
             return "invalid_length" if data else None if images else "ok"
         if len(data) != row.size:
@@ -189,9 +189,9 @@ class Oracle:
             case _:
                 return None
 
-    def is_outside(self, row: Row | None, data: bytes) -> bool:
+    def is_outside(self, row: Row, data: bytes) -> bool:
         """Return whether a value of a telecommand is outside its limits."""
-        return row is not None and any(field.fault(field.read(data)) for field in row.named.values())
+        return any(field.fault(field.read(data)) for field in row.named.values())
 
     def _mode_verdict(self, wanted: str) -> str | None:
         votes = {wanted in _COMMANDED.get(mode, _RUNNING) for mode in self.modes}
@@ -206,17 +206,17 @@ class Oracle:
             return "invalid_parameter"
         return None if parameter.name in _BOUND else "ok"
 
-    def counted(self, kind: str) -> None:
+    def counted(self, request: Request) -> None:
         """A request was received."""
-        name = "telecommands" if kind == "telecommand" else "telemetry"
+        name = "telemetry" if request.telemetry else "telecommands"
         count = self.counts[name]
         self.counts[name] = None if count is None else (count + 1) & 0xFFFF
 
-    def executed(self, row: Row | None, row_id: int, data: bytes, code: str, *, sure: bool) -> None:
+    def executed(self, row: Row | None, request: Request, code: str, *, sure: bool) -> None:
         """A telecommand was answered with a code, which is the one expected or not for sure."""
-        self._last = (row_id, code) if sure else None
+        self._last = (request.id, code) if sure else None
         if row is not None and code == "ok":
-            self._take_effect(row, self._arguments(row, data))
+            self._take_effect(row, self._arguments(row, request.data))
 
     def _take_effect(self, row: Row, arguments: Mapping[str, Any]) -> None:
         match row.action:
@@ -270,7 +270,7 @@ class Oracle:
     def _set(self, changes: Mapping[str, Known | None]) -> None:
         self.values.update(changes)
         if changes.keys() & _TIMING:
-            self.attitudes.retimed(self.now_s, self.values)
+            self.attitudes.retimed(self.now_s)
 
     def _set_clock(self, arguments: Mapping[str, Any]) -> None:
         if self._definition.conventions.epoch_ns is None:  # the day is that of the clock
@@ -294,7 +294,7 @@ class Oracle:
         """Judge the telemetry of a row, received now."""
         if len(data) != row.size:
             raise Violation(f"{row.name}: {len(data)} bytes, not {row.size}")
-        by_quantity: dict[str, tuple[Field, Value]] = {}
+        by_quantity: Readings = {}
         for name, value in row.decode(data).items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise Violation(f"{row.name}.{name}: {value}")
@@ -302,7 +302,7 @@ class Oracle:
         self.judge(row.name, by_quantity)
         self.judge_attitude(row.name, by_quantity)
 
-    def judge(self, name: str, read: Mapping[str, tuple[Field, Value]]) -> None:
+    def judge(self, name: str, read: Readings) -> None:
         """Judge the quantities of a row or PDO, received now, apart from its attitude."""
         for quantity, (field, value) in read.items():
             where = f"{name}.{field.name}"
@@ -315,11 +315,11 @@ class Oracle:
             elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF:
                 self._learn(quantity, value)
 
-    def judge_attitude(self, name: str, read: Mapping[str, tuple[Field, Value]]) -> None:
+    def judge_attitude(self, name: str, read: Readings) -> None:
         """Judge the attitude in a row, or in the PDOs of an instant."""
         if "attitude.valid" in read:
             imaging = bool(self.modes & IMAGING)
-            self.attitudes.judge(name, read, self.now_s, self.values, imaging=imaging)
+            self.attitudes.judge(name, read, self.now_s, imaging=imaging)
 
     def _check_parameter(self, where: str, field: Field, value: Value, name: str) -> None:
         known = self.values[name]
@@ -425,9 +425,6 @@ class Oracle:
             if self._frames is not None and value < self._frames and self._frames - value < 128:
                 raise Violation(f"{where}: {value} after {self._frames}")
             self._frames = value
-
-    def _check_period(self, where: str, field: Field, value: Value) -> None:
-        self.attitudes.check_period(where, field, value, self.now_s, self.values)
 
     def _check_error(self, where: str, _field: Field, value: Value) -> None:
         if self._last is not None and isinstance(value, str) and value != self._last[1]:

@@ -6,7 +6,7 @@ Requests are encoded and answers decoded by the judge, not by the product's code
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from starhil.hil_tests.judge import can, canopen
 from starhil.hil_tests.judge.definition import Unit
@@ -21,42 +21,25 @@ Deliver = Callable[[Any], None]
 Take = Callable[[], Sequence[tuple[float, Any]]]
 
 
-class Port(Protocol):
-    """An OBC on one link."""
-
-    def ask(self, *requests: Request) -> None:
-        """Send requests without a pause; raise ValueError or OverflowError for one that cannot be written."""
-        ...
-
-    def cut(self, request: Request, share: float) -> None:
-        """Send the first part of a request, as a client that goes away."""
-        ...
-
-    def answers(self) -> list[Heard]:
-        """Return what has arrived."""
-        ...
-
-
 class SerialPort:
     """An OBC on a serial line; `dialect` is that of the answers, of a unit that has several."""
 
     def __init__(self, unit: Unit, deliver: Deliver, take: Take, dialect: str | None) -> None:
         self._deliver, self._take = deliver, take
-        self._line = SerialLine(unit, dialect)
-        self.dialect = self._line.dialect
+        self.line = SerialLine(unit, dialect)
 
     def ask(self, *requests: Request) -> None:
         """Send requests in one piece."""
-        self._deliver(b"".join(self._line.post(request) for request in requests))
+        self._deliver(b"".join(self.line.post(request) for request in requests))
 
     def cut(self, request: Request, share: float) -> None:
         """Send the first bytes of a request."""
-        data = self._line.encode(request)
+        data = self.line.encode(request)
         self._deliver(data[: max(1, int(share * len(data)))])
 
     def answers(self) -> list[Heard]:
         """Return what has arrived."""
-        return [(at_s, answer) for at_s, chunk in self._take() for answer in self._line.feed(chunk)]
+        return [(at_s, answer) for at_s, chunk in self._take() for answer in self.line.feed(chunk)]
 
 
 class CanPort:
@@ -191,6 +174,9 @@ class CanopenPort:
     def set_state(self, command: int) -> None:
         """Send an NMT command to the node."""
         self._deliver(CanFrame(canopen.NMT, bytes((command, self.node)), extended=False))
+
+
+Port = SerialPort | CanPort | CanopenPort
 
 
 def objects_of(unit: Unit) -> Objects:

@@ -59,14 +59,5 @@ class LiveUnit(Protocol):
     def set_peer(self, link: str, *, reads: bool) -> None:
         """Set whether the peer of a link reads."""
 
-    def internal_errors(self) -> list[str]:
-        """Return the internal errors since the last call."""
-
-    def open_descriptors(self) -> int:
-        """Return the number of open file descriptors."""
-
-    def queued_events(self) -> int:
-        """Return the number of queued events."""
-
-    def memory_bytes(self) -> int:
-        """Return the memory in use, bytes."""
+    def defect(self) -> str:
+        """Return what is wrong inside and does not show on the bus, such as an error or a leak; empty if nothing is."""

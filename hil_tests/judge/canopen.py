@@ -163,13 +163,12 @@ def entries(unit: Unit, layout: Any) -> Iterator[Entry]:
     """Yield the entries of the application."""
     for placed in layout.object:
         index, at = placed.index, f"{placed.index:04x}"
+        command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
         if placed.telemetry is not None and placed.type is not None:
-            row = unit.telemetry[placed.telemetry]
-            command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
-            yield replace(whole_row(index, 0, row), name=at, command=command)
+            whole = whole_row(index, 0, unit.telemetry[placed.telemetry])
+            yield replace(whole, name=at, command=command)
         elif placed.telemetry is not None:
             row = unit.telemetry[placed.telemetry]
-            command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
             for number, slot in enumerate(places(row), 1):
                 part = None if command is None else slot
                 yield Entry(index, number, f"{at}.{slot.name}", slot.size, row, slot, command, part)

@@ -15,35 +15,33 @@ from starhil.hil_tests.judge.rows import SIZES
 WORD: Final = 0xFFFFFFFF
 
 
-def check_function(
-    model: Any, order: Any, custom: Callable[[str], Callable[[bytes], bytes]]
-) -> Callable[[bytes], bytes]:
+def check_function(model: Any, order: Literal["little", "big"], plugin: Any) -> Callable[[bytes], bytes]:
     """Return the check that a definition selects, as a function from the covered bytes to the bytes sent.
 
-    `custom` returns a check of the unit's plugin by name.
+    `order` is the byte order if it has none of its own; `plugin` has the custom checks of the unit by name.
     """
-    order = getattr(model, "order", None) or order
-    match model.kind:
-        case "none":
-            return lambda _covered: b""
-        case "sum":
-            return lambda covered: _sum(covered, SIZES[model.type], model.complement).to_bytes(
-                SIZES[model.type], order
-            )
-        case "xor":
-            size = SIZES[model.type]
-            return lambda covered: _xor(covered, size, model.init, order).to_bytes(size, order)
-        case "fletcher16":
-            return lambda covered: _fletcher(covered, model.modulus).to_bytes(2, order)
-        case "crc":
-            size = SIZES[model.type]
-            return lambda covered: crc(
-                covered, 8 * size, model.poly, model.init, model.xor, reflect=model.reflect
-            ).to_bytes(size, order)
-        case "xxh32":
-            return lambda covered: xxh32(covered, model.seed).to_bytes(4, order)
-        case _:
-            return custom(model.name)
+    if model.kind == "none":
+        return lambda _covered: b""
+    if model.kind == "custom":
+        check: Callable[[bytes], bytes] = plugin.checks[model.name]
+        return check
+    order = model.order or order
+    size = {"fletcher16": 2, "xxh32": 4}.get(model.kind) or SIZES[model.type]
+
+    def number(covered: bytes) -> int:
+        match model.kind:
+            case "sum":
+                return _sum(covered, size, model.complement)
+            case "xor":
+                return _xor(covered, size, model.init, order)
+            case "fletcher16":
+                return _fletcher(covered, model.modulus)
+            case "crc":
+                return crc(covered, 8 * size, model.poly, model.init, model.xor, reflect=model.reflect)
+            case _:
+                return xxh32(covered, model.seed)
+
+    return lambda covered: number(covered).to_bytes(size, order)
 
 
 def described(model: Any) -> str:

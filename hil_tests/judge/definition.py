@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from starhil.hil_tests.judge.framings import Framing, Measure, Taken
+from starhil.hil_tests.judge.framings import Measure, Taken
 from starhil.hil_tests.judge.messages import PUBLISHED, Request, Value
 from starhil.hil_tests.judge.rows import PARAMETER, SIZES, Field, Row, single
 from starhil.protocol.definition import InterfaceDefinition
@@ -72,8 +72,6 @@ class Unit:
         Rows that the serial line does not answer.
     errors, device_errors
         Number of each error of a request, and of each cause of the error mode, by name.
-    telecommand_crc
-        Whether a telecommand may be followed by its CRC-8.
     canopen
         Model of `[canopen]`: objects and PDOs; None if the unit has none.
     """
@@ -87,14 +85,12 @@ class Unit:
     device_parameters: Mapping[str, Parameter]
     serial: Any
     can: Any
-    byte_order: Literal["little", "big"]
-    conventions: Any = None
+    conventions: Any
     classes: tuple[Any, ...] = ()
     unanswered: frozenset[str] = frozenset()
     errors: Mapping[str, int] = field(default_factory=dict)
     device_errors: Mapping[str, int] = field(default_factory=dict)
     first_telemetry_id: int | None = None
-    telecommand_crc: bool = False
     plugin: Any = None
     canopen: Any = None
 
@@ -135,20 +131,31 @@ class Unit:
         return () if row.name in self.unanswered else row.answers
 
     @cached_property
-    def reported_data(self) -> tuple[tuple[Row, Row, slice], ...]:
-        """Each telecommand whose last data telemetry reports, the row that does, and which of its bytes they are."""
-        found = []
+    def reported(self) -> tuple[tuple[Row, Row, Mapping[str, str]], ...]:
+        """Each telecommand all of whose fields a telemetry row reports, the row, and the row's field for each of them.
+
+        The row includes the fields of the telecommand, or has the same parameters in the same layout.
+        """
+        found = {}
         for row in self.telemetry.values():
-            firsts = {
-                item.telecommand: item
-                for item in tuple(row.named.values())[::-1]
-                if item.telecommand is not None
-            }
-            for name, first in firsts.items():
+            for name in {
+                item.telecommand: None for item in row.named.values() if item.telecommand is not None
+            }:
                 command = self.telecommands[name]
-                start = first.offset - command.named[first.name].offset
-                found.append((command, row, slice(start, start + command.size)))
-        return tuple(found)
+                found[name, row.name] = command, row, {field: field for field in command.named}
+        for command in self.telecommands.values():
+            fields = {
+                item.of_parameter: item.name for item in command.named.values() if item.parameter is not None
+            }
+            for row in self.telemetry.values() if command.action == "set_parameters" and fields else ():
+                places = {
+                    fields[item.of_parameter]: item.name
+                    for item in row.named.values()
+                    if item.of_parameter in fields
+                }
+                if len(places) == len(fields):
+                    found[command.name, row.name] = command, row, places
+        return tuple(found.values())
 
     def request(self, row: Row | int, data: bytes = b"", klass: str = "") -> Request:
         """Return the request for a row, or for an ID, which need not belong to one."""
@@ -182,7 +189,6 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
         device_parameters={item.name: _parameter(item) for item in icd.device_parameters.values()},
         serial=serial,
         can=icd.link.can,
-        byte_order=icd.conventions.byte_order,
         conventions=icd.conventions,
         classes=icd.classes,
         unanswered=frozenset(
@@ -192,7 +198,6 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
         errors=icd.errors,
         device_errors=icd.enum("device_error").values,
         first_telemetry_id=icd.first_telemetry_id,
-        telecommand_crc=icd.conventions.telecommand_crc,
         plugin=icd.plugin,
         canopen=icd.canopen,
     )
@@ -241,17 +246,7 @@ def _fields(row: Any, icd: InterfaceDefinition) -> Iterator[Field]:
         offset += size
 
 
-def plugin_check(unit: Unit, name: str) -> Any:
-    """Return a check of the unit's plugin."""
-    return unit.plugin.checks[name]
-
-
-def plugin_framing(unit: Unit) -> Framing:
-    """Return the framing of the unit's plugin."""
-    return _PluginFraming(unit)
-
-
-class _PluginFraming:
+class PluginFraming:
     """A framing of a plugin, whose own deframer finds the messages."""
 
     marks = b"\x1f\x7f\xff"

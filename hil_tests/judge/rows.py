@@ -26,6 +26,13 @@ SIZES: Final = {
     "u8": 1, "i8": 1, "u16": 2, "i16": 2, "u24": 3, "i24": 3, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "f32": 4, "f64": 8,
 }  # fmt: skip
 """Bytes of each type of number."""
+FORMATS: Final = {
+    ("little", "f32"): "<f",
+    ("little", "f64"): "<d",
+    ("big", "f32"): ">f",
+    ("big", "f64"): ">d",
+}
+"""Format of floating types in `struct`, by byte order."""
 LARGEST: Final = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": math.inf}
 """Largest finite number of each floating type; any finite number fits f64."""
 PARAMETER: Final = "parameter."
@@ -94,6 +101,11 @@ class Field:
         return (1e-9 if self.kind == "float" else 0.51) * abs(self.scale)
 
     @property
+    def of_parameter(self) -> tuple[object, ...]:
+        """Parameter and layout; fields that are alike in them carry the same numbers."""
+        return self.parameter, self.unit, self.kind, self.type, self.width, self.scale, self.bias
+
+    @property
     def type_limits(self) -> tuple[int, int]:
         """Lowest and highest raw number that the bits can hold."""
         bits = self.width or 8 * self.size
@@ -137,41 +149,36 @@ class Field:
                 return next(iter(self.enum or {}), 0)
             case _:
                 low, high = self.limits
-                return (
-                    min(max(0.0, low), high)
-                    if self.kind == "float" or self.scale != 1.0
-                    else min(max(0, low), high)
-                )
+                return min(max(0.0 if self.kind == "float" or self.scale != 1.0 else 0, low), high)
 
-    def bytes_of(self, value: Value) -> bytes:
-        """Return the bytes of a field that shares them with no other."""
+    def raw_of(self, value: Value) -> int | float | bytes:
+        """Return the raw value of a physical one; a member of an enumeration by its name or number."""
         if isinstance(value, bytes):
-            return value.ljust(self.size, b"\0")
+            if self.type != "bytes":
+                raise TypeError(f"{self.name}: bytes are not a number")
+            return value
         if self.kind == "text":
-            return str(value).encode("latin-1").ljust(self.size, b"\0")
-        if self.kind == "float":
-            return self.bytes_of_float((float(value) - self.bias) / self.scale)
-        return self.bytes_of_raw(self.raw_of(value))
-
-    def bytes_of_float(self, raw: float) -> bytes:
-        """Return the bytes of a raw floating-point number."""
-        return struct.pack(
-            ("<" if self.order == "little" else ">") + {"f32": "f", "f64": "d"}[self.type], raw
-        )
-
-    def bytes_of_raw(self, raw: int) -> bytes:
-        """Return the bytes of a raw integer."""
-        return raw.to_bytes(self.size, self.order, signed=self.type.startswith("i"))
-
-    def raw_of(self, value: Value) -> int:
-        """Return the raw number of a flag, a member of an enumeration, or a physical number."""
+            return str(value).encode("latin-1")
         if isinstance(value, str) or (isinstance(value, bool) and self.enum is not None):
             return (self.enum or {})[str(value).lower() if isinstance(value, bool) else value]
-        if isinstance(value, bytes):
-            raise TypeError(f"{self.name}: bytes are not a number")
+        if self.kind == "float":
+            return (value - self.bias) / self.scale
         if self.kind in ("enum", "flag") or (self.scale == 1.0 and self.bias == 0.0):
             return round(value)
         return round((value - self.bias) / self.scale)
+
+    def write(self, data: bytearray, raw: float | bytes) -> None:
+        """Write a raw value to the bytes of a row; zeros complete raw bytes and text."""
+        place = slice(self.offset, self.offset + self.size)
+        if isinstance(raw, bytes):
+            data[place] = raw.ljust(self.size, b"\0")
+        elif self.type in LARGEST:
+            data[place] = struct.pack(FORMATS[self.order, self.type], raw)
+        elif self.width:
+            others = int.from_bytes(data[place], self.order) & ~((1 << self.width) - 1 << self.shift)
+            data[place] = (others | int(raw) << self.shift).to_bytes(self.size, self.order)
+        else:
+            data[place] = int(raw).to_bytes(self.size, self.order, signed=self.type.startswith("i"))
 
     def read(self, data: bytes) -> int | float | bytes:
         """Return the raw value in the bytes of a row."""
@@ -179,10 +186,7 @@ class Field:
         if self.type == "bytes":
             return piece
         if self.type in LARGEST:
-            (number,) = struct.unpack(
-                ("<" if self.order == "little" else ">") + {"f32": "f", "f64": "d"}[self.type], piece
-            )
-            return float(number)
+            return float(struct.unpack(FORMATS[self.order, self.type], piece)[0])
         number = int.from_bytes(piece, self.order, signed=self.type.startswith("i") and not self.width)
         return number >> self.shift & (1 << self.width) - 1 if self.width else number
 
@@ -198,8 +202,7 @@ class Field:
             return next(
                 (members.get(name, name) for name, number in names.items() if number == raw), int(raw)
             )
-        scaled = self.scale != 1.0 or self.bias != 0.0
-        return raw * self.scale + self.bias if scaled else raw
+        return raw * self.scale + self.bias if self.scale != 1.0 or self.bias != 0.0 else raw
 
     def fault(self, raw: float | bytes) -> str | None:
         """Return what is wrong with a received raw value; None if it is as defined."""
@@ -219,28 +222,41 @@ class Field:
             inside = self.raw_limits[0] <= raw <= self.raw_limits[1]
         return None if inside else f"outside {low:g} to {high:g}"
 
-    def any_value(self, special: bytes, turn: int, rng: random.Random) -> Value:
-        """Return a value within the limits, if possible made of special bytes in the first two turns, else random."""
-        size = self.size
-        pattern = (special * (turn + size))[turn:][:size] if turn < 2 and special else rng.randbytes(size)
+    def random_value(self, rng: random.Random, *, at_limit: bool = False) -> Value:
+        """Return a value within the limits; of a number, a limit (or 0 or 1 of a float) if wanted."""
         match self.kind:
             case "bytes":
-                return pattern
+                return rng.randbytes(self.size)
             case "text":
-                return "star"[:size]
+                return "x" * rng.randint(0, self.size)
             case "flag":
                 return rng.random() < 0.5
             case "enum":
-                return rng.choice(list(self.enum or {"": 0}))
+                return rng.choice(list(self.enum or ()))
             case "float":
+                low, high = self.limits
+                edges = [edge for edge in (low, high, 0.0, 1.0) if low <= edge <= high and abs(edge) < 1e30]
+                at_limit = at_limit or high - low > 1e9
+                return rng.choice(edges) if at_limit and edges else rng.uniform(low, high)
+            case _:
+                return self.physical(
+                    rng.choice(self.raw_limits) if at_limit else rng.randint(*self.raw_limits)
+                )
+
+    def any_value(self, special: bytes, turn: int, rng: random.Random) -> Value:
+        """Return a value within the limits, if possible made of special bytes in the first two turns, else random."""
+        if turn < 2 and special:
+            pattern = (special * (turn + self.size))[turn:][: self.size]
+            if self.kind == "bytes":
+                return pattern
+            if self.kind == "float":
                 number = float(self.read(bytes(self.offset) + pattern))
                 low, high = self.limits
                 return min(max(number if abs(number) < 1e30 else 0.0, low), high)
-            case _:
-                low_raw, high_raw = self.raw_limits
-                raw = int.from_bytes(pattern, self.order)
-                chosen = raw if low_raw <= raw <= high_raw else rng.randint(low_raw, high_raw)
-                return self.physical(chosen)
+            raw = int.from_bytes(pattern, self.order)
+            if self.kind in ("integer", "bits") and self.raw_limits[0] <= raw <= self.raw_limits[1]:
+                return self.physical(raw)
+        return self.random_value(rng)
 
 
 def single(number: float) -> float:
@@ -310,12 +326,7 @@ class Row:
             raise LookupError(f"{self.name} has no field {', '.join(given.keys() - self.named.keys())}")
         data = bytearray(self.size)
         for name, item in self.named.items():
-            place = slice(item.offset, item.offset + item.size)
-            if item.width:
-                whole = int.from_bytes(data[place], item.order) | item.raw_of(given[name]) << item.shift
-                data[place] = whole.to_bytes(item.size, item.order)
-            else:
-                data[place] = item.bytes_of(given[name])
+            item.write(data, item.raw_of(given[name]))
         return bytes(data)
 
     def decode(self, data: bytes) -> dict[str, Value]:
@@ -338,27 +349,23 @@ class Row:
         """Yield data of a telecommand with one field outside its limits, each with a name of what is wrong."""
         good = self.encode()
 
-        def placed(piece: bytes) -> bytes:
-            return good[: item.offset] + piece + good[item.offset + item.size :]
-
-        def with_raw(raw: int) -> bytes:
-            if item.width:
-                whole = int.from_bytes(good[item.offset : item.offset + item.size], item.order)
-                raw = whole & ~((1 << item.width) - 1 << item.shift) | raw << item.shift
-            return placed(item.bytes_of_raw(raw))
+        def with_raw(raw: float | bytes) -> bytes:
+            data = bytearray(good)
+            item.write(data, raw)
+            return bytes(data)
 
         if item.kind == "float":
             low, high = item.limits
             step = 0.1 * max(abs(low), abs(high), 1.0)
-            yield "nan", placed(item.bytes_of_float(math.nan))
-            yield "infinite", placed(item.bytes_of_float(math.inf))
+            yield "nan", with_raw(math.nan)
+            yield "infinite", with_raw(math.inf)
             if item.minimum is not None:
-                yield "low", placed(item.bytes_of(low - step))
+                yield "low", with_raw(item.raw_of(low - step))
             if item.maximum is not None:
-                yield "high", placed(item.bytes_of(high + step))
+                yield "high", with_raw(item.raw_of(high + step))
         elif item.kind == "enum" and not item.width:
             known = set((item.enum or {}).values())
-            yield "unknown", placed(item.bytes_of_raw(next(n for n in range(255, -1, -1) if n not in known)))
+            yield "unknown", with_raw(next(n for n in range(255, -1, -1) if n not in known))
         elif item.kind in ("integer", "bits"):
             (low_raw, high_raw), (least, greatest) = item.raw_limits, item.type_limits
             if low_raw > least:

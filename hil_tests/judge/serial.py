@@ -27,7 +27,7 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 from starhil.hil_tests.judge.checks import check_function, described
-from starhil.hil_tests.judge.definition import Unit, plugin_check, plugin_framing
+from starhil.hil_tests.judge.definition import PluginFraming, Unit
 from starhil.hil_tests.judge.framings import Framing, Taken
 from starhil.hil_tests.judge.framings.counted import Counted
 from starhil.hil_tests.judge.framings.delimited import Delimited
@@ -222,7 +222,7 @@ def _framing(unit: Unit, model: Any) -> Framing:
         case "delimited":
             return Delimited(model)
         case _:
-            return plugin_framing(unit)
+            return PluginFraming(unit)
 
 
 class Headed:
@@ -241,13 +241,13 @@ class Headed:
         classes: tuple[str, ...],
         elsewhere: tuple[str, ...],
     ) -> None:
-        link = unit.serial
+        link, order = unit.serial, unit.conventions.byte_order
         self._unit = unit
         self._klass = classes[0] if len(classes) == 1 else ""
         self._classes, self._elsewhere = classes, elsewhere
         self._start = framing.start
         self._check = described(check)
-        self._compute = check_function(check, unit.byte_order, partial(plugin_check, unit))
+        self._compute = check_function(check, order, unit.plugin)
         self.covers = getattr(check, "covers", [])
         self.check_size = len(self._compute(b""))
         sizes = {"start": len(self._start), "check": self.check_size, "end": len(framing.end)}
@@ -256,8 +256,8 @@ class Headed:
         replies = [(item.name, item.code if item.reply is None else item.reply) for item in coded]
         self._unsolicited = {item.unsolicited for item in coded if item.unsolicited is not None}
         replies += [(item.name, item.unsolicited) for item in coded if item.unsolicited is not None]
-        self.requests = Header(link.request_header, unit.byte_order, requests, sizes)
-        self.replies = Header(link.reply_header, unit.byte_order, replies, sizes)
+        self.requests = Header(link.request_header, order, requests, sizes)
+        self.replies = Header(link.reply_header, order, replies, sizes)
         self._codes = dict(requests)
         self.has_codes = "status" in self.replies.roles() or CODE in (link.refusal or "")
         self.sequence_bits = self.requests.width("sequence")
@@ -279,11 +279,9 @@ class Headed:
 
     def closed(self, header: bytes, data: bytes) -> bytes:
         """Return header, data and check."""
-        return header + data + self._compute(self._covered(header, data))
-
-    def _covered(self, header: bytes, data: bytes) -> bytes:
         parts = {"start": self._start, "header": header, "data": data}
-        return b"".join(parts[name] for name in ("start", "header", "data") if name in self.covers)
+        covered = b"".join(part for name, part in parts.items() if name in self.covers)
+        return header + data + self._compute(covered)
 
     def size(self, begun: bytes, asked: Request | None) -> int | None:
         """Return the size of header, data and check."""
@@ -324,7 +322,7 @@ class Headed:
         if opened is None or request is None:
             return malformed()
         header, data = taken.body[: opened.size], taken.body[opened.size : end]
-        computed = self._compute(self._covered(header, data))
+        computed = self.closed(header, data)[len(header) + len(data) :]
         if computed != taken.body[end:]:
             received = taken.body[end:].hex(" ")
             return malformed(fault=f"check {self._check}: computed {computed.hex(' ')}, received {received}")
@@ -451,4 +449,8 @@ class Dialect:
 
 
 Envelope = Headed | Dialect
-"""What surrounds the data of a message within its framing."""
+"""What surrounds the data of a message within its framing.
+
+`sequence_bits` is the width of the number of a request, 0 without one; `numbers` is how many numbers an answer may have;
+`has_codes` is whether a refusal carries a code.
+"""

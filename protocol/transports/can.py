@@ -16,12 +16,15 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT
 from starhil.protocol.transports.base import Transport, TransportError
 from starhil.protocol.transports.hub_client import AutoHubTransport, HubTransport
-from starhil.protocol.transports.python_can import OpenBus, PythonCanTransport
+from starhil.protocol.transports.python_can import PythonCanTransport
 
 CanTransport = Transport[CanFrame]
 
-BITRATE: Final = 1_000_000
-"""Bit rate of adapters that the transport configures (slcan), bit/s."""
+_OPTIONS: Final[dict[str, dict[str, Any]]] = {
+    "slcan": {"bitrate": 1_000_000},
+    "udp_multicast": {"hop_limit": 0},
+}
+"""Options of python-can's interfaces."""
 
 RECEIVE_BUFFER: Final = 4 * 1024 * 1024
 """Receive buffer of a kernel CAN socket (bytes), where the system allows it."""
@@ -84,18 +87,13 @@ def _socketcand(spec: str, where: str) -> CanTransport:
 
 
 def _python_can(interface: str, channel: str) -> CanTransport:
-    options: dict[str, Any] = {}
-    if interface == "udp_multicast":
-        options["hop_limit"] = 0
-    elif interface == "slcan":
-        options["bitrate"] = BITRATE
-    opener: OpenBus = partial(_open_bus, interface, channel, options)
+    opener = partial(_open_bus, interface, channel)
     return PythonCanTransport(f"{interface}:{channel}", opener, echoes=interface == "udp_multicast")
 
 
-def _open_bus(interface: str, channel: str, options: dict[str, Any]) -> can.BusABC:
+def _open_bus(interface: str, channel: str) -> can.BusABC:
     if interface != "socketcan":
-        return can.Bus(interface=interface, channel=channel, **options)
+        return can.Bus(interface=interface, channel=channel, **_OPTIONS.get(interface, {}))
     _check_kernel(channel)
     bus = SocketcanBus(channel)
     _enlarge_receive_buffer(bus.socket)

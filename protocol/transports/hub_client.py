@@ -147,15 +147,13 @@ class HubTransport(ReconnectingTransport[CanFrame]):
 
     async def close(self) -> None:
         """Leave the bus; send the queue first if the hub reads it."""
-        if self._outbox:
-            self._flush_outbox()
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(self.drain(), CLOSE_S)
         await super().close()
 
 
 class AutoHubTransport(HubTransport):
-    """Joins the hub at an address, and starts it in this process whenever none answers there.
+    """Joins the hub at an address, and starts it in this process whenever nobody listens there.
 
     Port 0 starts a new hub at a free port.
     """
@@ -165,33 +163,21 @@ class AutoHubTransport(HubTransport):
         self._hub: CanHub | None = None
 
     async def _open(self) -> None:
-        await self._ensure_hub()
+        if self._hub is None:
+            hub = CanHub(self._host, self._port)
+            try:
+                await hub.start()
+            except ProtocolError:
+                pass  # somebody listens there
+            else:
+                self._hub = hub
+                if self._reconnection is not None:
+                    _LOGGER.warning(
+                        "CAN %s: the hub there has ended; this process serves it now", self.description
+                    )
+                self._port = hub.port
+                self.description = f"socketcand:{self._host}:{self._port}/{self._bus}"
         await super()._open()
-
-    async def _ensure_hub(self) -> None:
-        if self._hub is not None or (self._port and await self._is_served()):
-            return
-        hub = CanHub(self._host, self._port)
-        try:
-            await hub.start()
-        except ProtocolError:
-            if not await self._is_served():
-                raise
-            return
-        self._hub = hub
-        if self._reconnection is not None:
-            _LOGGER.warning("CAN %s: the hub there has ended; this process serves it now", self.description)
-        self._port = hub.port
-        self.description = f"socketcand:{self._host}:{self._port}/{self._bus}"
-
-    async def _is_served(self) -> bool:
-        """Return whether a server listens at the address."""
-        try:
-            _, writer = await asyncio.open_connection(self._host, self._port)
-        except OSError:
-            return False
-        writer.close()
-        return True
 
     async def close(self) -> None:
         """Leave the bus, and stop the hub if it runs in this process."""

@@ -145,12 +145,11 @@ class PtyTransport(PacedTransport):
             self._path = os.ttyname(slave)
             if self._symlink is not None:
                 self._make_symlink(self._symlink, self._path)
-        except OSError as error:
-            self._close_master()
+        except (OSError, TransportError) as error:
+            os.close(self._master)
+            if isinstance(error, TransportError):
+                raise
             raise TransportError(f"serial pty: cannot be set up: {error.strerror}; try again") from None
-        except TransportError:
-            self._close_master()
-            raise
         finally:
             os.close(slave)  # the master reports a hang-up while no peer has it open
         self.description = str(self._symlink) if self._symlink is not None else self._path
@@ -183,11 +182,13 @@ class PtyTransport(PacedTransport):
         asyncio.get_running_loop().call_soon(self._readable)  # one wake-up stands for all waiting data
         self._process_received(data)
 
-    def _drop_unread(self, peers: PtyPeers) -> None:
-        """Drop bytes that a closed peer has not read, and bytes queued for it."""
+    def _drop_unread(self, peers: PtyPeers) -> bool:
+        """Drop bytes that a closed peer has not read, and bytes queued for it; return whether a peer has closed the port."""
         if peers.all_left():
             self._clear()
             peers.discard_unread()
+            return True
+        return False
 
     def _has_peer(self) -> bool:
         if self._peers is None:
@@ -196,12 +197,7 @@ class PtyTransport(PacedTransport):
         return self._peers.present
 
     def _write(self, data: bytes) -> int:
-        if self._peers is None:
-            raise OSError(errno.EBADF, "port is closed")
-        if self._peers.all_left():
-            self._peers.discard_unread()
-            raise OSError(errno.ENOTCONN, "the peer left")  # the writer drops its queue
-        if not self._peers.present:
+        if self._peers is None or self._drop_unread(self._peers) or not self._peers.present:
             raise OSError(errno.ENOTCONN, "no peer")
         return write_fd(self._master, data)
 
@@ -217,8 +213,4 @@ class PtyTransport(PacedTransport):
                     self._symlink.unlink()
         self._peers.close()
         self._peers = None
-        self._close_master()
-
-    def _close_master(self) -> None:
         os.close(self._master)
-        self._master = -1

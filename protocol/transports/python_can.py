@@ -59,7 +59,6 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         self._bus: can.BusABC | None = None
         self._fd = -1
         self._thread: threading.Thread | None = None
-        self._stop = threading.Event()
         self._queue: deque[CanFrame] = deque()
         self._timer: asyncio.Handle | None = None
         self._idle = asyncio.Event()
@@ -78,9 +77,8 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         if self._fd >= 0:
             loop.add_reader(self._fd, self._readable)
         else:
-            self._stop = threading.Event()
             self._thread = threading.Thread(
-                target=self._read_in_thread, args=(bus, self._stop, loop), name="can-reader", daemon=True
+                target=self._read_in_thread, args=(bus, loop), name="can-reader", daemon=True
             )
             self._thread.start()
 
@@ -108,14 +106,12 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         # frames that the bus object has buffered raise no event
         asyncio.get_running_loop().call_soon(self._readable)
 
-    def _read_in_thread(
-        self, bus: can.BusABC, stop: threading.Event, loop: asyncio.AbstractEventLoop
-    ) -> None:
-        while not stop.is_set():
+    def _read_in_thread(self, bus: can.BusABC, loop: asyncio.AbstractEventLoop) -> None:
+        while self._bus is bus:
             try:
                 message = bus.recv(READ_TIMEOUT_S)
             except (can.CanError, OSError, ValueError) as error:
-                if not stop.is_set():
+                if self._bus is bus:
                     self._from_thread(loop, partial(self._lost, str(error)))
                 return
             if message is not None:
@@ -207,7 +203,6 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         if self._fd >= 0:
             asyncio.get_running_loop().remove_reader(self._fd)
             self._fd = -1
-        self._stop.set()
         bus, self._bus = self._bus, None
         if bus is not None:
             with contextlib.suppress(can.CanError, OSError):
@@ -245,7 +240,6 @@ def _message(frame: CanFrame) -> can.Message:
         data=frame.data,
         is_extended_id=frame.extended,
         is_remote_frame=frame.remote,
-        dlc=len(frame.data),
     )
 
 

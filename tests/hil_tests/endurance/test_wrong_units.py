@@ -1,5 +1,6 @@
 """Each thing that a unit must never do is a violation, named as what it is: wrong answers, wrong values, wrong attitudes."""
 
+import logging
 import math
 from dataclasses import replace
 from itertools import count
@@ -301,8 +302,8 @@ def test_an_unknown_parameter_must_be_refused():
     row = UNIT.telecommands["set_parameter"]
     known = row.encode({"parameter": UNIT.parameters["exposure"].id, "value": 50.0})
     unknown = row.encode({"parameter": 253, "value": 50.0})
-    assert oracle_of().verdict(row, "telecommand", known) is None  # bounded by other parameters
-    assert oracle_of().verdict(row, "telecommand", unknown) == "invalid_parameter"
+    assert oracle_of().verdict(row, UNIT.request(row, known)) is None  # bounded by other parameters
+    assert oracle_of().verdict(row, UNIT.request(row, unknown)) == "invalid_parameter"
 
 
 def test_a_lens_is_dark_since_it_was_first_covered():
@@ -328,7 +329,7 @@ def test_a_clock_set_to_a_time_of_day_is_not_known(tmp_path):
     field = field_of("clock.seconds", unit)
     with pytest.raises(Violation):
         oracle.judge("clock", {"clock.seconds": (field, 5)})
-    oracle.executed(row, 1, row.encode({"t": 5}), "ok", sure=True)
+    oracle.executed(row, unit.request(row, row.encode({"t": 5})), "ok", sure=True)
     oracle.judge("clock", {"clock.seconds": (field, 5)})
 
 
@@ -361,7 +362,7 @@ def judge(read, *, imaging=True, now_s=10.0, dark_since_s=None, unit=UNIT, forge
     oracle.values |= dict.fromkeys(forget)
     attitudes = oracle.attitudes
     attitudes.dark_since_s = dark_since_s
-    attitudes.judge("row", read, now_s, oracle.values, imaging=imaging)
+    attitudes.judge("row", read, now_s, imaging=imaging)
     return attitudes.count
 
 
@@ -420,9 +421,10 @@ def test_a_right_attitude_is_compared_where_it_can_be(name):
 )
 def test_three_numbers_are_an_attitude_if_the_scalar_is_known(sign, scalar, counted):
     q = Quaternion(math.sqrt(1.0 - scalar**2), 0.0, 0.0, scalar)
-    judge_ = AttitudeJudge(UNIT.conventions.model_copy(update={"scalar_sign": sign}), SIGMA_ARCSEC)
+    conventions = UNIT.conventions.model_copy(update={"scalar_sign": sign})
+    judge_ = AttitudeJudge(conventions, oracle_of().values, SIGMA_ARCSEC)
     judge_.motions = [Motion(0.0, q, (0.0, 0.0, 0.0))]
-    judge_.judge("row", reading_of(q[:3]), 10.0, oracle_of().values, imaging=True)
+    judge_.judge("row", reading_of(q[:3]), 10.0, imaging=True)
     assert judge_.count == counted
 
 
@@ -434,10 +436,15 @@ def growing(first, step):
     return lambda _unit: next(numbers)
 
 
+def failing(_unit):
+    logging.getLogger("starhil.internal").error("ValueError: x")
+    return 0
+
+
 @pytest.mark.parametrize(
     ("name", "function", "expected"),
     [
-        ("internal_errors", lambda _unit: ["ValueError: x"], "internal error: ValueError: x"),
+        ("open_descriptors", failing, "internal error: ValueError: x"),
         ("queued_events", lambda _unit: 5001, "5001 events are queued"),
         ("open_descriptors", growing(10, 5), "descriptors are open, 10 at the start"),
         ("memory_bytes", growing(0, 65 << 20), "65 MiB of memory more than at the start"),

@@ -1,10 +1,13 @@
-"""A shortened life as a session script, for a run by hand."""
+"""A life that ends in a violation: shortened to the fewest steps that still show it, and as a session for a run by hand."""
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
-from starhil.hil_tests.endurance.life import Life
+from starhil.hil_tests.endurance.life import Life, Step
 from starhil.hil_tests.endurance.ports import HOST
 from starhil.hil_tests.judge import can
 from starhil.hil_tests.judge.definition import Unit
@@ -14,6 +17,40 @@ from starhil.hil_tests.raw_traffic import format_frame
 from starhil.protocol.can_framing import CanFrame
 
 LONGEST_WAIT_S = 3600.0
+
+
+def kind_of(violation: str) -> str:
+    """Return a violation without its numbers, to tell whether two are of the same kind."""
+    return re.sub(r"-?\d[\d.e+-]*", "#", violation)
+
+
+def shortened(life: Life, fails: Callable[[Life], bool], *, attempts: int = 400) -> Life:
+    """Return the life with as few steps as possible for which `fails` holds (delta debugging, Zeller 1999).
+
+    At most this many `attempts` are made to live a shorter life.
+    """
+    left = attempts
+
+    def still_fails(steps: Sequence[Step]) -> bool:
+        nonlocal left
+        left -= 1
+        return fails(replace(life, steps=tuple(steps)))
+
+    steps = list(life.steps)
+    size = max(1, len(steps) // 2)
+    while left > 0:
+        removed = False
+        start = 0
+        while start < len(steps) and left > 0:
+            rest = steps[:start] + steps[start + size :]
+            if still_fails(rest):
+                steps, removed = rest, True
+            else:
+                start += size
+        if size == 1 and not removed:
+            break
+        size = max(1, size // 2)
+    return replace(life, steps=tuple(steps))
 
 
 def session_of(life: Life, definition: Unit, violation: str) -> str:
