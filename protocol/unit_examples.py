@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
+from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
@@ -84,7 +85,17 @@ def _messages(
 ) -> tuple[Request, list[Reply]]:
     """Return the request for a row and its answers."""
     request = icd.request(row, row.encode(values) if row.kind == "telecommand" else b"")
-    return request, [_reply(icd, row, answer, request, values) for answer in answers]
+    replies = []
+    for answer in answers:
+        named = icd.telemetry[answer.partition(":")[2]] if answer.startswith("row:") else row
+        if answer == "echo":
+            replies.append(Reply.echo(request))
+        elif named.kind == "telecommand":
+            replies.append(Reply(ReplyKind.ACK, row.id, klass=row.klass))
+        else:
+            data = named.encode(values if named is row else named.sample(), saturate=True)
+            replies.append(Reply(ReplyKind.TELEMETRY, named.id, data, klass=named.klass))
+    return request, replies
 
 
 def examine(
@@ -103,23 +114,11 @@ def examine(
     if not errors:
         try:
             if definition.canopen is not None:
-                build_dictionary(definition)
+                build_eds(DeviceDictionary(definition))
             examples += exchanges(definition)
         except ProtocolError as error:
             errors.append(f"{path}: {error}")
     return definition, errors, examples
-
-
-def _reply(
-    icd: InterfaceDefinition, row: Row, answer: str, request: Request, values: Mapping[str, Value]
-) -> Reply:
-    if answer == "echo":
-        return Reply.echo(request)
-    named = icd.telemetry[answer.partition(":")[2]] if answer.startswith("row:") else row
-    if named.kind == "telecommand":
-        return Reply(ReplyKind.ACK, row.id, klass=row.klass)
-    data = named.encode(values if named is row else named.sample(), saturate=True)
-    return Reply(ReplyKind.TELEMETRY, named.id, data, klass=named.klass)
 
 
 def _check_framing(stack: SerialStack, row: Row, request: Request) -> None:

@@ -194,8 +194,8 @@ def _dotted(document: Any, location: Sequence[int | str]) -> str:
             here = here[step]
         except (KeyError, IndexError, TypeError):
             here = None
-        named = here.get("name", here.get("heading")) if isinstance(here, dict) else None
-        steps.append(str(named if named is not None and isinstance(step, int) else step))
+        named = here.get("name", here.get("heading", here.get("id"))) if isinstance(here, dict) else None
+        steps.append(named if isinstance(named, str) and isinstance(step, int) else str(step))
     return ".".join(steps)
 
 

@@ -1,254 +1,458 @@
 """Cases written as dialogues: what the master sends, and what the node must answer.
 
-    40 {text} > *; 70 > abort TOGGLE {text}; 60 > abort COMMAND; kept
+    40 {text} > *
+    70 > abort TOGGLE {text}
+    if 1003 kept 1003:0
 
-Lines are separated by semicolons. `REQUEST > ANSWER` sends bytes, padded to 8, and looks at the next frame of the node;
-without a request, it looks at the frame after that, and after `wait` for as long as a transfer may take to time out.
-An answer is one of
+They are in files of cases (`case_file`), in areas with `links = ["canopen"]`; one step per line, `#` begins a comment.
+`REQUEST > ANSWER` sends bytes by SDO, padded to 8, and looks at
+the next frame of the node; without a request, it looks at the frame after that, and after `wait` for as long as a
+transfer may take to time out. An answer is one of
 
     60 {text} 00000000      these bytes; `..` is any byte, a final `*` any others
     abort A|B MUX           an abort with one of these codes, for this object if one is given
     unless abort A|B MUX    either this abort, which ends the dialogue, or another answer
-    segment N               segment N of a block
+    segment N DATA          segment N of a block, with this data if any is given
     block MUX               the answer to a block download, with a block size of 1 to 127
     silence, *, -           no answer; any answer or none; do not wait
+    silence or abort A      one of several answers
 
 Other lines begin with a verb:
 
-    need 1016 1010:3            skip the case if an object or entry is missing
-    set 1017:0 20 u16           write a number; it must be accepted
-    set 1003:0 1 u8 > A|B       it must be refused with one of these aborts; VALUES stands for those of a wrong value
-    set 1010:1 save             write a text
-    holds 1005:0 0x80 0x7ff     read a number, and look at the bits of a mask
-    value BYTES, kept           read the writable number: these bytes, or as it was before the dialogue
+    need 1016 1010:3, lacks 1800:4      skip the case if an object or entry is missing, or is there
+    if 1019 LINE                the line, if the EDS has the object or entry
+    set 1017:0 20|30 u16        write numbers (u8 to u64, i8 to i64), which must be accepted
+    set 1010:1 save, set 2000:1 0a0b bytes      write a text, bytes
+    set 1003:0 1 u8 > A|B       each must be refused with one of these aborts; VALUES stands for those of a wrong value
+    holds 1005:0 0x80 u32 0x7ff     read a number, a text or bytes; of a number, the bits of a mask if one is given
+    default 1017:0              read a number, which is the default of the EDS
+    read 1003:1 > A|B, read 1000:0      a read must be refused, accepted
+    note 1017:0, kept 1017:0    remember the bytes of an entry; they must be the same again
+    segments BYTES              the upload that has begun returns these bytes in segments
+    upload MUX 127 BYTES no-crc     block upload with this many segments in a block, of these bytes if any are given
     nmt 1, nmt 1 all, nmt 1 other       an NMT command to the node, to all nodes, to another node
-    boot-up, state 7f           the boot-up message; the next heartbeat, with this state
-    none {heartbeat} 0.3        no frame with this CAN ID, within a time, s
+    reset, reset node, boot-up  reset of communication or node with its boot-up message; that message alone
+    state 7f                    the next heartbeat, with this state
+    send 000 01 extended        a frame, with 29 bits of CAN ID or as a remote frame if so said
+    frame 181 2a00 0.5          the next frame with this CAN ID, with these bytes if any are given, within a time, s
+    event 181 2a00 3.0          the same; skip the case if none comes
+    none {heartbeat} 0.3 00     no frame with this CAN ID, or with this data too, within a time, s
+    count 080 0.15 5 8          the number of frames in a time, s, and its limits
+    counted 01 02, period 0.04 0.06     their data, from the first on; limits of their mean distance, s
     guard 7f, guard             node guarding is answered with this state and toggle bit, or not at all
     watched                     a heartbeat of the node that this one watches
-    emcy 8130 0.3, calm 0.4     this EMCY, or none, within a time, s
-    send 000 01 extended        a frame, with 29 bits of CAN ID or as a remote frame if so said
-    sleep 0.2, drain, quiet, reset      wait; forget what was received; PDOs and heartbeat off; reset of the communication
-    clock, took 0.08 0.16       start of a time; its limits, s
-
-and of PDOs:
-
-    transmit 1 start=3          the first TPDO carries a constant object, with this transmission type; other settings as in `set_up`
-    carry 1800 255 times=2      the first TPDO or RPDO (1400) carries a writable object, which is restored at the end
+    emcy 8130 0.3, register 11  this EMCY within a time, s; its error register has these bits (00: none), as has 1001h
+    cause, clear                cause or clear the error {error}
+    fill-history                cause and clear it more often than the error history has entries
+    map {tpdo} 1 {constant} event_ms=20     configure a PDO: transmission type, mapping entries, and can_id, inhibit, event_ms, start
     off 1800                    disable the PDO with this communication record
     sync, sync 3                a SYNC, or one with a counter
-    tpdo 2a00, tpdo, no-tpdo 0.1        the TPDO comes with these bytes or any, or not within a time, s
-    event-tpdo 2a00 3.0         the same within a time; skip the case if it does not come
-    rest 0.1                    wait for a TPDO that may come or not
-    rpdo 2a00, put 2a00, object 2a00    send the RPDO; write the carried object by SDO; its value
+    sleep 0.2, drain, quiet     wait; forget what was received; PDOs and heartbeat off
+    clock, took 0.08 0.16       start of a time; its limits, s
+    lss                         select the node by LSS, to which all further requests go; skip the case if it has none
+    scan VENDOR PRODUCT REVISION SERIAL     Fastscan finds this identity
+    node 2d                     the node has another node ID from now on
+    finally                     the lines from here on follow in any case, also if one before has failed
 
-Names in braces are in `Names`; all are found before the first request.
+Indices, CAN IDs and data are in hexadecimal. Names in braces are in `canopen_names`; all are found before the first request.
 """
 
 from __future__ import annotations
 
+import inspect
 import re
-from binascii import crc_hqx
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import Final
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from functools import cache, partial
+from pathlib import Path
+from string import Formatter
+from typing import Annotated, Any, Final
 
-from canopen.objectdictionary import ODVariable, datatypes
-
+from starhil.hil_tests.conformance.canopen_names import FINDERS, PARTS, TPDO, Names, default_id, provoke
 from starhil.hil_tests.conformance.canopen_probe import (
     ANSWER_S,
+    LSS_FROM_SLAVE,
+    LSS_TO_SLAVE,
+    NO_RTR,
     NOBODY,
+    PDO_OFF,
+    RESET_COMMUNICATION,
+    RESET_NODE,
     VALUE_ABORTS,
     Abort,
     CanopenProbe,
     check_abort,
     check_answer,
-    is_integer,
-    size_of,
 )
-from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
-from starhil.hil_tests.conformance.pdo_setup import (
-    TPDO,
-    Carried,
-    constant,
-    entry,
-    first,
-    pdo_id,
-    send_sync,
-    set_up,
-    writable,
+from starhil.hil_tests.conformance.case import (
+    Case,
+    CaseFailed,
+    CaseSkipped,
+    case_in,
+    check,
+    check_equal,
 )
-from starhil.hil_tests.judge.canopen import HEARTBEAT, SDO_REQUEST, SDO_RESPONSE, multiplexer
+from starhil.hil_tests.conformance.case_file import read_case_file
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.judge.canopen import ABORT, HEARTBEAT, SDO_RESPONSE, SEGMENT, SYNC
+from starhil.protocol.names import did_you_mean
 
 LONGEST_TIMEOUT_S: Final = 12.0
 """Maximum time in which a node aborts a transfer whose client stops sending."""
-
 SHOWN_STEPS: Final = 4
 """Number of steps before a failed one in its message."""
-IDENTITY: Final = ("vendor", "product", "revision", "serial")
-"""Parts of 1018h, from sub-index 1 on."""
-COB_IDS: Final = {"request": SDO_REQUEST, "response": SDO_RESPONSE, "heartbeat": HEARTBEAT}
-"""CAN IDs to which the node ID is added."""
-
-Ask = Callable[[bytes, float], bytes | None]
-"""Sends a request (empty: none) and returns the next answer within a time, or None."""
+NEEDED: Final = {"emcy": "emcy_id", "cause": "error", "fill-history": "error", "lss": "vendor"}
+"""Verb → name that it needs, found before the first request too."""
+ANSWERS: Final = {"abort", "unless", "segment", "block", "silence", "*", "-"}
+"""First words of answers other than bytes."""
 
 
-@dataclass(frozen=True)
-class Dialogue:
-    """A case as a dialogue; id, title, clause and intrusive as in a case, with the area's defaults."""
-
-    id: str
-    title: str
-    lines: str
-    clause: str | None = None
-    intrusive: bool | None = None
+# --- the words of a line ---
 
 
-class Names(dict[str, str]):
-    """The names in braces, in hexadecimal, each found when it is first used.
+def _entry(text: str) -> tuple[int, int]:
+    index, subindex = text.split(":")
+    return int(index, 16), int(subindex, 16)
 
-    `text`, `number`, `write_only`: multiplexer of a long readable text, of a writable number of 16 bits, of an object
-    that cannot be read; `new`, `low`, `high`: another value for the number, and its bytes; `crc`, `bad_crc`: CRC of this
-    value, and another; `tpdo`, `tpdo_id`: index and default CAN ID of the first TPDO; `value`: of the constant object;
-    `before`, `other`, `changed`: values of the carried object; `node`; `request`, `response`, `heartbeat`: CAN IDs, and
-    `other_request`: that of another node; `vendor`, `product`, `revision`, `serial`: parts of the identity.
+
+def _item(text: str) -> str:
+    if not re.fullmatch("[0-9a-fA-F]{4}(:[0-9a-fA-F]{1,2})?", text):
+        raise ValueError(f"{text!r} is not INDEX or INDEX:SUBINDEX")
+    return text
+
+
+def _aborts(text: str) -> tuple[int, ...]:
+    return tuple(
+        code for name in text.split("|") for code in (VALUE_ABORTS if name == "VALUES" else (Abort[name],))
+    )
+
+
+def _object(text: str) -> tuple[str, int]:
+    """Read a mapping entry, with an empty name, or a setting of a PDO, `name=number`."""
+    name, _, number = text.rpartition("=")
+    if name not in ("", "can_id", "inhibit", "event_ms", "start"):
+        raise ValueError(f"unknown setting {name!r}")
+    return name, int(number, 0)
+
+
+def _data_of(values: str, kind: str = "") -> list[bytes]:
+    """Return values as bytes: texts, hexadecimal digits, or numbers of a kind such as `u16`."""
+    if kind in ("", "bytes"):
+        return [bytes.fromhex(value) if kind else value.encode() for value in values.split("|")]
+    if not re.fullmatch("[ui](8|16|24|32|40|48|56|64)", kind):
+        raise ValueError(f"unknown kind {kind!r}")
+    size, signed = int(kind[1:]) // 8, kind[0] == "i"
+    return [int(value, 0).to_bytes(size, "little", signed=signed) for value in values.split("|")]
+
+
+def _name(entry: tuple[int, int]) -> str:
+    return f"{entry[0]:04X}h:{entry[1]:02X}h"
+
+
+Number = Annotated[int, partial(int, base=0)]
+Hex = Annotated[int, partial(int, base=16)]
+Bytes = Annotated[bytes, bytes.fromhex]
+Entry = Annotated[tuple[int, int], _entry]
+Item = Annotated[str, _item]
+Objects = Annotated[tuple[str, int], _object]
+Aborts = Annotated[tuple[int, ...], _aborts]
+
+
+@cache
+def _parameters(verb: str) -> inspect.Signature:
+    return inspect.signature(getattr(_Master, verb), eval_str=True)
+
+
+def _call(verb: str, words: Sequence[str], refused: str) -> inspect.BoundArguments:
+    """Read the words behind a verb; words with names in braces remain texts.
+
+    Raises ValueError, TypeError, LookupError: a word is wrong, missing or too much.
     """
+    if refused and "refused" not in _parameters(verb).parameters:
+        raise ValueError("nothing may follow >")
+    call = _parameters(verb).bind(None, *words, **({"refused": refused} if refused else {}))
+    for name, given in call.arguments.items():
+        kind = call.signature.parameters[name].annotation
+        if isinstance(given, tuple):
+            call.arguments[name] = tuple(_read(word, kind) for word in given)
+        elif given is not None:
+            call.arguments[name] = _read(given, kind)
+    return call
 
-    def __init__(self, probe: CanopenProbe) -> None:
-        self._probe = probe
 
-    @cached_property
-    def carried(self) -> Carried:
-        """The writable object for a PDO."""
-        return writable(self._probe)
+def _read(word: str, kind: Any) -> Any:
+    return word if "{" in word else getattr(kind, "__metadata__", [kind])[0](word)
+
+
+def _parts(line: str) -> tuple[str, list[str], str]:
+    """Return the verb of a line, empty for a request; its words; and what follows `>`."""
+    head, _, answer = (part.strip() for part in line.partition(">"))
+    words = head.split()
+    verb = words[0].replace("-", "_") if words else ""
+    if not verb.startswith("_") and hasattr(_Master, verb):
+        return verb, words[1:], answer
+    return "", words, answer
+
+
+def _lines(text: str) -> list[tuple[int, str]]:
+    """Return the lines of a dialogue with their numbers, without comments and empty lines."""
+    lines = ((number, line.partition("#")[0].split(";")) for number, line in enumerate(text.splitlines(), 1))
+    return [(number, step.strip()) for number, steps in lines for step in steps if step.strip()]
+
+
+def _faults(line: str) -> Iterator[str]:
+    """Yield what is wrong with a line."""
+    try:
+        if line.startswith("if "):
+            _, needed, line = line.split(maxsplit=2)
+            _read(needed, Item)
+        for name in {name for _, name, _, _ in Formatter().parse(line) if name is not None} - FINDERS.keys():
+            yield f"unknown name {name!r}{did_you_mean(name, FINDERS)}"
+        verb, words, answer = _parts(line)
+        if verb:
+            _call(verb, words, answer)
+            if verb in ("set", "holds") and "{" not in line:
+                _data_of(*words[1:3])
+        elif line != "finally":
+            yield from _faults_of_request(words, answer)
+    except (ValueError, TypeError, LookupError, OverflowError) as error:
+        yield f"{line}: {error}"
+
+
+def _faults_of_request(words: Sequence[str], answer: str) -> Iterator[str]:
+    try:
+        bytes.fromhex("".join(word for word in words if "{" not in word and words != ["wait"]))
+    except ValueError:
+        verbs = [name.replace("_", "-") for name in vars(_Master) if not name.startswith("_")]
+        yield f"unknown verb {words[0]!r}{did_you_mean(words[0], verbs)}"
+        return
+    for wanted in answer.removeprefix("unless ").split(" or "):
+        kind, *details = wanted.split() or [""]
+        if kind == "abort":
+            _aborts(details[0])
+        elif kind not in ANSWERS and not re.fullmatch(
+            r"([0-9a-f]{2}|\.\.|\{\w+\}|\*$)+", wanted.replace(" ", "")
+        ):
+            yield f"unknown answer {wanted!r}"
+
+
+# --- files ---
+
+
+def dialogue_cases(path: Path) -> list[Case[CanopenProbe]]:
+    """Return the cases on CANopen in a file of cases.
+
+    Raises BenchError: the file cannot be read, or has errors; one line for each.
+    """
+    file = read_case_file(path)
+    items = [(area, item) for area in file.area if "canopen" in area.links for item in area.cases]
+    texts = _Texts(file.texts)
+    found = [
+        f"{path}: {area.name}.{item.id}: line {number}: {fault}"
+        for area, item in items
+        for number, line in _lines(item.lines.format_map(texts))
+        for fault in _faults(line)
+    ]
+    if found:
+        raise BenchError(*found)
+    return [
+        case_in(
+            f"canopen.{area.name}",
+            item.id,
+            item.title,
+            partial(_hold, [line for _, line in _lines(item.lines.format_map(texts))]),
+            item.clause or area.clause,
+            intrusive=area.intrusive if item.intrusive is None else item.intrusive,
+        )
+        for area, item in items
+    ]
+
+
+class _Texts(dict[str, str]):
+    """Texts of a file for names in braces; other names remain."""
 
     def __missing__(self, name: str) -> str:
-        self[name] = found = self._find(name)
-        return found
-
-    def _find(self, name: str) -> str:
-        probe = self._probe
-        if name == "text":
-            return mux(long_text(probe)[0])
-        if name == "number":
-            return mux(writable_number(probe))
-        if name == "write_only":
-            return mux(probe.find("write-only object", lambda item: item.access_type == "wo"))
-        if name == "tpdo":
-            return f"{next(iter(probe.pdo_indices(TPDO)), TPDO):04x}"
-        if name == "tpdo_id":
-            return f"{pdo_id(first(probe, TPDO), probe.node):03x}"
-        if name in ("before", "other", "changed"):
-            return bytes(getattr(self.carried, name)).hex()
-        if name == "value":
-            return probe.value(constant(probe)).hex()
-        if name == "node":
-            return f"{probe.node:02x}"
-        if name in COB_IDS:
-            return f"{COB_IDS[name] + probe.node:03x}"
-        if name == "other_request":
-            return f"{COB_IDS['request'] + probe.node % 127 + 1:03x}"
-        if name in IDENTITY:
-            return probe.read(0x1018, IDENTITY.index(name) + 1).hex()
-        before = probe.value(writable_number(probe))
-        new = bytes((before[0] ^ 0x55, before[1] ^ 0x01))
-        crc = crc_hqx(new, 0).to_bytes(2, "little")
-        bad = bytes((crc[0], crc[1] ^ 1))
-        return {"new": new, "low": new[:1], "high": new[1:], "crc": crc, "bad_crc": bad}[name].hex()
+        return f"{{{name}}}"
 
 
-def add_dialogues(
-    area: CaseArea[CanopenProbe],
-    table: Iterable[Dialogue],
-    ask_of: Callable[[CanopenProbe], Ask] | None = None,
-    prepare: Callable[[CanopenProbe], object] = lambda _probe: None,
-) -> None:
-    """Add one case per dialogue; `ask_of` returns how its requests are sent, by default by SDO; `prepare` precedes it."""
-
-    def run(row: Dialogue, probe: CanopenProbe) -> None:
-        prepare(probe)
-        hold(probe, row.lines, (ask_of or sdo)(probe))
-
-    for row in table:
-        area.case(row.id, row.title, row.clause, intrusive=row.intrusive)(partial(run, row))
+# --- holding a dialogue ---
 
 
-def sdo(probe: CanopenProbe) -> Ask:
-    """Return how requests are sent to the SDO server."""
-
-    def ask(data: bytes, timeout_s: float) -> bytes | None:
-        return probe.ask(data, timeout_s) if data else probe.wait_for(SDO_RESPONSE + probe.node, timeout_s)
-
-    return ask
-
-
-def hold(probe: CanopenProbe, lines: str, ask: Ask) -> None:
-    """Hold a dialogue."""
-    for needed in re.findall(r"need ([\w: ]+)", lines):
-        probe.require(*needed.split())
+def _hold(lines: list[str], probe: CanopenProbe) -> None:
+    for line in lines:
+        if line.startswith("need "):
+            probe.require(*line.split()[1:])
     names = Names(probe)
-    master = _Master(probe, lines, names)
-    steps = [step.strip() for step in lines.format_map(names).split(";")]
-    for number, step in enumerate(steps):
-        try:
-            if _ends(master, step, ask):
-                break
-        except CaseFailed as failure:
-            before = f", after {'; '.join(steps[max(0, number - SHOWN_STEPS) : number])}" if number else ""
-            raise CaseFailed(
-                f"{failure.expected} (step {number + 1}: {step}{before})", failure.seen
-            ) from None
-    if "carry" in lines:
-        master.put(names.carried.before.hex())
+    words = [word for line in lines for word in line.split()]
+    for name in (name for verb, name in NEEDED.items() if verb in words):
+        names[name]
+    steps = [line.format_map(names) for line in lines]
+    last = steps.index("finally") if "finally" in steps else len(steps)
+    master = _Master(probe, names)
+    try:
+        master(steps[:last])
+    except BaseException:
+        with suppress(CaseFailed):
+            master(steps[last + 1 :])
+        raise
+    master(steps[last + 1 :])
+
+
+def _check(seen: bytes | None, wanted: str) -> None:
+    """Check the answer to a request."""
+    kind, *details = wanted.split()
+    match kind:
+        case "silence":
+            check(seen is None, "no answer", seen or "an empty frame")
+        case "abort":
+            check_abort(seen, *_aborts(details[0]), multiplexer="".join(details[1:]))
+        case "segment":
+            number, *data = details
+            check(seen is not None, f"segment {number} of the block", seen)
+            check_equal((seen or b"\0")[0] & 0x7F, int(number), "segment number")
+            if data:
+                check_equal((seen or b"")[1:], bytes.fromhex("".join(data)), "data of the segment")
+        case "block":
+            check(seen is not None and seen[0] & 0xFB == 0xA0, "answer A0h or A4h", seen)
+            check_equal((seen or b"")[1:4].hex(), details[0], "multiplexer")
+            check(1 <= (seen or bytes(5))[4] <= 127, "block size 1 to 127", seen)
+        case "*" | "-":
+            pass
+        case _:
+            check_answer(seen, wanted)
 
 
 class _Master:
-    """The verbs of a dialogue, with the words that follow them."""
+    """The verbs of a dialogue, whose `-` is a `_` here; words are read as their types demand."""
 
-    def __init__(self, probe: CanopenProbe, lines: str, names: Names) -> None:
-        self.drain, self.quiet, self.reset = probe.drain, probe.quiet, probe.reset_communication
-        self.boot_up, self.watched = probe.expect_boot_up, probe.send_watched_heartbeat
+    def __init__(self, probe: CanopenProbe, names: Names) -> None:
         self._probe, self._names = probe, names
-        self._pdo_id, self._began = 0, 0.0
-        self._emergency = probe.emergency_id() if re.search("emcy|calm", lines) else 0
-        self._number = writable_number(probe) if re.search("value|kept", lines) else None
-        self._before = b"" if self._number is None else probe.value(self._number)
+        self._has_lss, self._began = False, 0.0
+        self._noted: dict[tuple[int, int], bytes] = {}
+        self._counted: list[tuple[float, bytes]] = []
+        self._emergency = b""
 
-    def need(self, *_indices: str) -> None:
+    def __call__(self, steps: Sequence[str]) -> None:
+        """Take steps until one ends the dialogue."""
+        for number, step in enumerate(steps):
+            try:
+                if self._ends(step):
+                    return
+            except CaseFailed as failure:
+                before = (
+                    f", after {'; '.join(steps[max(0, number - SHOWN_STEPS) : number])}" if number else ""
+                )
+                raise CaseFailed(
+                    f"{failure.expected} (step {number + 1}: {step}{before})", failure.seen
+                ) from None
+
+    def _ends(self, line: str) -> bool:
+        """Do what a line says, and check the answer; return whether the dialogue ends with it."""
+        if line.startswith("if "):
+            _, needed, line = line.split(maxsplit=2)
+            if self._probe.lacks(needed):
+                return False
+        verb, words, answer = _parts(line)
+        if verb:
+            call = _call(verb, words, answer)
+            getattr(self, verb)(*call.args[1:], **call.kwargs)
+            return False
+        waits = words == ["wait"]
+        timeout_s = {"silence": 0.1, "-": 0.0}.get(answer, LONGEST_TIMEOUT_S if waits else ANSWER_S)
+        seen = self._ask(b"" if waits else bytes.fromhex("".join(words)), timeout_s)
+        is_optional = answer.startswith("unless ")
+        if is_optional and seen is not None and seen[0] != ABORT:
+            return False
+        failures = []
+        for wanted in answer.removeprefix("unless ").split(" or "):
+            try:
+                _check(seen, wanted)
+            except CaseFailed as failure:
+                failures.append(failure)
+            else:
+                return is_optional
+        raise CaseFailed(" or ".join(failure.expected for failure in failures), failures[0].seen)
+
+    def _ask(self, data: bytes, timeout_s: float = ANSWER_S) -> bytes | None:
+        """Send a request, unless it is empty, to the SDO server or by LSS; return the next answer within a time."""
+        if data and self._has_lss:
+            self._probe.send(LSS_TO_SLAVE, data.ljust(8, b"\0"))
+        elif data:
+            self._probe.send_request(data)
+        answers = LSS_FROM_SLAVE if self._has_lss else SDO_RESPONSE + self._probe.node
+        return self._probe.wait_for(answers, timeout_s) if timeout_s else None
+
+    # Entries
+
+    def need(self, *_entries: Item) -> None:
         pass  # checked before the dialogue
 
-    def set(self, entry: str, value: str, kind: str = "", *refused: str) -> None:
-        index, subindex = (int(part, 16) for part in entry.split(":"))
-        data = int(value, 0).to_bytes(int(kind[1:]) // 8, "little") if kind else value.encode()
+    def lacks(self, *entries: Item) -> None:
+        for item in entries:
+            if not self._probe.lacks(item):
+                raise CaseSkipped(f"the EDS has {item}")
+
+    def set(self, entry: Entry, values: str, kind: str = "", *, refused: Aborts = ()) -> None:
+        for data in _data_of(values, kind):
+            if refused:
+                self._probe.expect_refusal(*entry, data, *refused)
+            else:
+                self._probe.set(*entry, data)
+
+    def read(self, entry: Entry, *, refused: Aborts = ()) -> None:
         if refused:
-            self._probe.expect_refusal(index, subindex, data, len(data), *_codes(refused[1]))
+            self._probe.expect_unreadable(*entry, *refused)
         else:
-            self._probe.set(index, subindex, data)
+            self._probe.read(*entry)
 
-    def holds(self, entry: str, number: str, mask: str = "-1") -> None:
-        index, subindex = (int(part, 16) for part in entry.split(":"))
-        check_equal(self._probe.number(index, subindex) & int(mask, 0), int(number, 0), f"{index:04X}h")
+    def holds(self, entry: Entry, value: str, kind: str = "", mask: Number = -1) -> None:
+        both = self._probe.read(*entry), *_data_of(value, kind)
+        numbers = [int.from_bytes(data, "little", signed=kind[:1] == "i") & mask for data in both]
+        seen, wanted = numbers if kind[:1] in ("u", "i") else both
+        check_equal(seen, wanted, _name(entry))
 
-    def value(self, *data: str) -> None:
-        check_equal(self._read(), bytes.fromhex("".join(data)), "value")
+    def default(self, entry: Entry) -> None:
+        item = self._probe.od.get_variable(*entry)
+        check_equal(self._probe.number(*entry), 0 if item is None else item.default, _name(entry))
 
-    def kept(self) -> None:
-        check_equal(self._read(), self._before, "value as before")
+    def note(self, entry: Entry) -> None:
+        self._noted[entry] = self._probe.read(*entry)
 
-    def _read(self) -> bytes:
-        return b"" if self._number is None else self._probe.value(self._number)
+    def kept(self, entry: Entry) -> None:
+        check_equal(self._probe.read(*entry), self._noted[entry], f"{_name(entry)}, as before:")
 
-    def nmt(self, command: str, whom: str = "") -> None:
+    # Long transfers
+
+    def segments(self, value: Bytes) -> None:
+        for start in range(0, len(value), SEGMENT):
+            data, toggle = value[start : start + SEGMENT], 0x10 * (start // SEGMENT % 2)
+            head = toggle | SEGMENT - len(data) << 1 | (start + SEGMENT >= len(value))
+            check_answer(self._ask(bytes([0x60 | toggle])), f"{head:02x}{data.hex()}*")
+
+    def upload(self, mux: Bytes, block: Number, value: Bytes = b"", crc: str = "") -> None:
+        seen = self._probe.upload_blocks(mux, block, crc=crc != "no-crc")
+        if value:
+            check_equal(seen, value, "value")
+
+    # States
+
+    def nmt(self, command: Number, whom: str = "") -> None:
         node = {"all": 0, "other": self._probe.node % 127 + 1}.get(whom)
-        self._probe.command(int(command), node)
+        self._probe.command(command, node)
+
+    def reset(self, whom: str = "") -> None:
+        self._probe.drain()
+        self._probe.command(RESET_NODE if whom == "node" else RESET_COMMUNICATION)
+        self._probe.expect_boot_up()
+
+    def boot_up(self) -> None:
+        self._probe.expect_boot_up()
 
     def state(self, wanted: str) -> None:
         check_equal(f"{self._probe.state():02x}", wanted, "state")
 
-    def none(self, can_id: str, for_s: str = "0.1") -> None:
-        self._probe.expect_silence(int(can_id, 16), f"frame with CAN ID 0x{can_id}", float(for_s))
+    def node(self, number: Hex) -> None:
+        self._probe.node = number
 
     def guard(self, wanted: str = "") -> None:
         can_id = HEARTBEAT + self._probe.node
@@ -259,141 +463,145 @@ class _Master:
         else:
             self._probe.expect_silence(can_id, "answer to node guarding", 0.2)
 
-    def emcy(self, code: str, within_s: str = str(ANSWER_S)) -> None:
-        self._probe.expect_emergency(self._emergency, int(code, 16), float(within_s))
+    def watched(self) -> None:
+        self._probe.send_watched_heartbeat()
 
-    def calm(self, for_s: str) -> None:
-        self._probe.expect_silence(self._emergency, "EMCY", float(for_s))
+    # Frames
 
-    def send(self, can_id: str, *content: str) -> None:
+    def send(self, can_id: Hex, *content: str) -> None:
         data = "".join(word for word in content if word not in ("extended", "remote"))
-        self._probe.send(int(can_id, 16), data, extended="extended" in content, remote="remote" in content)
+        self._probe.send(can_id, data, extended="extended" in content, remote="remote" in content)
 
-    def sleep(self, seconds: str) -> None:
-        self._probe.wait_for(NOBODY, float(seconds))
+    def frame(self, can_id: Hex, data: Bytes = b"", within_s: float = ANSWER_S) -> None:
+        seen = self._probe.expect(can_id, "frame", within_s)
+        check(data in (b"", seen), f"data {data.hex(' ')}", seen)
+
+    def event(self, can_id: Hex, data: Bytes, within_s: float = ANSWER_S) -> None:
+        seen = self._probe.wait_for(can_id, within_s)
+        if seen is None:
+            raise CaseSkipped("a write to a mapped object is not an event on this device")
+        check_equal(seen, data, "data")
+
+    def none(self, can_id: Hex, for_s: float = 0.1, data: Bytes = b"") -> None:
+        seen = self._probe.wait_for(can_id, for_s, lambda seen: data in (b"", seen))
+        check(seen is None, f"no frame with CAN ID 0x{can_id:03X}", seen or "an empty frame")
+
+    def count(self, can_id: Hex, for_s: float, least: Number, most: Number) -> None:
+        self._counted = self._probe.count(can_id, for_s)
+        number = len(self._counted)
+        check(
+            least <= number <= most,
+            f"{least} to {most} frames with CAN ID 0x{can_id:03X} in {for_s:g} s",
+            number,
+        )
+
+    def counted(self, *data: Bytes) -> None:
+        seen = [item.hex() for _, item in self._counted[: len(data)]]
+        check_equal(seen, [item.hex() for item in data], "data")
+
+    def period(self, least: float, most: float) -> None:
+        mean = (self._counted[-1][0] - self._counted[0][0]) / (len(self._counted) - 1)
+        check(least <= mean <= most, f"a period of {least:g} to {most:g} s", f"{mean:.4f} s")
+
+    def sync(self, *counter: Number) -> None:
+        self._probe.send(SYNC, bytes(counter))
+
+    def drain(self) -> None:
+        self._probe.drain()
+
+    def quiet(self) -> None:
+        self._probe.quiet()
+
+    def sleep(self, seconds: float) -> None:
+        self._probe.wait_for(NOBODY, seconds)
 
     def clock(self) -> None:
         self._began = self._probe.port.now()
 
-    def took(self, least: str, most: str) -> None:
+    def took(self, least: float, most: float) -> None:
         seconds = self._probe.port.now() - self._began
-        check(float(least) <= seconds <= float(most), f"after {least} to {most} s", f"{seconds:.3f} s")
+        check(least <= seconds <= most, f"after {least:g} to {most:g} s", f"{seconds:.3f} s")
+
+    # EMCY
+
+    def emcy(self, code: Hex, within_s: float = ANSWER_S) -> None:
+        can_id = int(self._names["emcy_id"], 16)
+        self._emergency = self._probe.expect(can_id, f"EMCY {code:04X}h", within_s)
+        check_equal(len(self._emergency), 8, "bytes of EMCY")
+        check_equal(self._emergency[:2], code.to_bytes(2, "little"), "error code")
+
+    def register(self, bits: Hex) -> None:
+        seen = self._emergency[2]
+        check(seen & bits if bits else not seen, f"error register {bits:02x}", f"{seen:02x}")
+        check_equal(self._probe.number(0x1001), seen, "1001h")
+
+    def cause(self) -> None:
+        provoke(self._probe, int(self._names["error"], 16))
+
+    def clear(self) -> None:
+        provoke(self._probe, int(self._names["error"], 16), b"")
+
+    def fill_history(self) -> None:
+        code = int(self._names["error"], 16)
+        length = max(self._probe.od.indices[0x1003].subindices)
+        for number in range(1, length + 3):
+            self.cause()
+            self.emcy(code)
+            check_equal(self._probe.number(0x1003, 0), min(number, length), "errors")
+            check_equal(self._probe.number(0x1003, 1) & 0xFFFF, code, "newest error")
+            self.clear()
+            self.emcy(0)
 
     # PDOs
 
-    def transmit(self, kind: str, *settings: str) -> None:
-        self._set_up(TPDO, [entry(constant(self._probe))], kind, settings)
+    def map(self, index: Hex, kind: Number, *words: Objects) -> None:
+        """Configure a PDO by the procedure of CiA 301; other PDOs and the heartbeat are off."""
+        probe, given = self._probe, dict(words)
+        objects = [number for name, number in words if not name]
+        flags = NO_RTR if index >= TPDO else 0
+        can_id = flags | given.get("can_id", default_id(index, probe.node))
+        probe.quiet()
+        probe.set(index, 1, PDO_OFF | can_id)
+        probe.set(index + 0x200, 0, 0, 1)
+        for position, value in enumerate(objects, 1):
+            probe.set(index + 0x200, position, value)
+        probe.set(index + 0x200, 0, len(objects), 1)
+        probe.set(index, 2, kind, 1)
+        for subindex, setting, size in (
+            (3, given.get("inhibit", 0), 2),
+            (5, given.get("event_ms", 0), 2),
+            (6, given.get("start"), 1),
+        ):
+            served = not probe.lacks(f"{index:x}:{subindex}")
+            if setting and not served:
+                raise CaseSkipped(f"{index:04X}h has no sub-index {subindex}")
+            if setting is not None and served:
+                probe.set(index, subindex, setting, size)
+        probe.set(index, 1, can_id)
+        probe.drain()
 
-    def carry(self, kind: str, transmission: str, *settings: str) -> None:
-        given = dict(setting.split("=") for setting in settings)
-        objects = [int(given.pop("behind"), 0)] if "behind" in given else []
-        objects += [entry(self._names.carried.item)] * int(given.pop("times", "1"))
-        self._set_up(int(kind, 16), objects, transmission, [f"{name}={text}" for name, text in given.items()])
+    def off(self, index: Hex) -> None:
+        self._probe.disable_pdo(index)
 
-    def _set_up(self, kind: int, objects: list[int], transmission: str, settings: Iterable[str]) -> None:
-        given = {name: int(text, 0) for name, text in (setting.split("=") for setting in settings)}
-        self._pdo_id = set_up(self._probe, first(self._probe, kind), objects, int(transmission), **given)
+    # LSS
 
-    def off(self, index: str) -> None:
-        self._probe.disable_pdo(int(index, 16))
+    def lss(self) -> None:
+        if not self._probe.od.device_information.LSS_supported:
+            raise CaseSkipped("the EDS has no LSS")
+        identity = [bytes.fromhex(self._names[part]) for part in PARTS]
+        self._has_lss = True
+        answer = [self._ask(bytes([command]) + part, 0.1) for command, part in enumerate(identity, 0x40)][-1]
+        check_equal(answer, b"\x44" + bytes(7), "answer to switch state selective")
 
-    def sync(self, counter: str = "") -> None:
-        send_sync(self._probe, int(counter) if counter else None)
+    def scan(self, *identity: Bytes) -> None:
+        def ask(number: int, bit: int, part: int, following: int) -> bool:
+            data = b"\x51" + number.to_bytes(4, "little") + bytes([bit, part, following])
+            return self._ask(data, 0.03) is not None
 
-    def tpdo(self, *data: str) -> None:
-        self._check_tpdo(self._probe.expect(self._pdo_id, "TPDO"), *data)
-
-    def event_tpdo(self, wanted: str, within_s: str = str(ANSWER_S)) -> None:
-        seen = self._probe.wait_for(self._pdo_id, float(within_s))
-        if seen is None:
-            raise CaseSkipped("a write to a mapped object is not an event on this device")
-        self._check_tpdo(seen, wanted)
-
-    def _check_tpdo(self, seen: bytes, *wanted: str) -> None:
-        for data in wanted:
-            check_equal(seen, bytes.fromhex(data), "data")
-
-    def no_tpdo(self, for_s: str = "0.1") -> None:
-        self._probe.expect_silence(self._pdo_id, "TPDO", float(for_s))
-
-    def rest(self, seconds: str) -> None:
-        self._probe.wait_for(self._pdo_id, float(seconds))
-
-    def rpdo(self, data: str) -> None:
-        self._probe.send(self._pdo_id, data)
-
-    def put(self, data: str) -> None:
-        self._probe.put(self._names.carried.item, bytes.fromhex(data))
-
-    def object(self, data: str) -> None:
-        check_equal(self._probe.value(self._names.carried.item), bytes.fromhex(data), "value")
-
-
-def _codes(names: str) -> tuple[int, ...]:
-    return VALUE_ABORTS if names == "VALUES" else tuple(Abort[name] for name in names.split("|"))
-
-
-def _ends(master: _Master, line: str, ask: Ask) -> bool:
-    """Do what a line says, and check the answer; return whether the dialogue ends with it."""
-    verb, *words = line.split()
-    act = getattr(master, verb.replace("-", "_"), None) if verb[:1].isalpha() else None
-    if act is not None:
-        act(*words)
-        return False
-    request, _, answer = (part.strip() for part in line.partition(">"))
-    data = b"" if request == "wait" else bytes.fromhex(request)
-    kind, *details = answer.split()
-    timeout_s = {"silence": 0.1, "-": 0.0}.get(kind, LONGEST_TIMEOUT_S if request == "wait" else ANSWER_S)
-    seen = ask(data, timeout_s)
-    match kind:
-        case "silence":
-            check(seen is None, f"no answer to {request}", seen or "an empty frame")
-        case "abort":
-            check_abort(seen, *_codes(details[0]), multiplexer="".join(details[1:]))
-        case "unless":
-            if seen is None or seen[0] == 0x80:
-                check_abort(seen, *_codes(details[1]), multiplexer="".join(details[2:]))
-                return True
-        case "segment":
-            check(seen is not None, f"segment {details[0]} of the block", seen)
-            check_equal((seen or b"\0")[0] & 0x7F, int(details[0]), "segment number")
-        case "block":
-            check(seen is not None and seen[0] & 0xFB == 0xA0, "answer A0h or A4h", seen)
-            check_equal((seen or b"")[1:4].hex(), details[0], "multiplexer")
-            check(1 <= (seen or bytes(5))[4] <= 127, "block size 1 to 127", seen)
-        case "*" | "-":
-            pass
-        case _:
-            check_answer(seen, answer)
-    return False
-
-
-# --- objects that every node has in some form ---
-
-
-def mux(item: ODVariable) -> str:
-    """Return the multiplexer of an object as hexadecimal text."""
-    return multiplexer(item.index, item.subindex).hex()
-
-
-def long_text(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
-    """Return a readable text that takes three segments, or two full ones if there is no longer text."""
-    two_segments: tuple[ODVariable, bytes] | None = None
-    for item in probe.variables():
-        if item.data_type in {datatypes.VISIBLE_STRING, datatypes.OCTET_STRING} and item.readable:
-            value = probe.try_read(item.index, item.subindex)
-            if isinstance(value, bytes) and len(value) > 14:
-                return item, value
-            if isinstance(value, bytes) and len(value) == 14 and two_segments is None:
-                two_segments = item, value
-    if two_segments is None:
-        raise CaseSkipped("no readable text of 14 bytes or more")
-    return two_segments
-
-
-def writable_number(probe: CanopenProbe) -> ODVariable:
-    """Return a writable 16-bit number without side effects, preferably the heartbeat time."""
-    return probe.od.get_variable(0x1017) or probe.find(
-        "writable 16-bit number",
-        lambda item: item.access_type == "rw" and is_integer(item) and size_of(item) == 2,
-    )
+        check(ask(0, 0x80, 0, 0), "an answer to the start of Fastscan", None)
+        for part, wanted in enumerate(identity):
+            number = 0
+            for bit in reversed(range(32)):
+                number |= (not ask(number, bit, part, part)) << bit
+            check_equal(number.to_bytes(4, "little"), wanted, f"part {part + 1} of the identity")
+            check(ask(number, 0, part, (part + 1) % 4), f"part {part + 1} of the identity confirmed", None)

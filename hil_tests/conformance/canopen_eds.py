@@ -9,8 +9,8 @@ from typing import Final
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe, is_integer, size_of
-from starhil.hil_tests.conformance.canopen_sdo import upload_blocks
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
+from starhil.hil_tests.judge.canopen import multiplexer
 
 EDS: Final = CaseArea[CanopenProbe]("canopen.eds", "CiA 306 4.5")
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)
@@ -176,7 +176,7 @@ def stored(probe: CanopenProbe) -> None:
     parser = _file(probe)
     served = configparser.RawConfigParser(inline_comment_prefixes=(";",))
     try:
-        data = upload_blocks(probe, item, 127)
+        data = probe.upload_blocks(multiplexer(item.index, item.subindex), 127)
     except CaseFailed:
         probe.abandon_transfer()
         data = probe.read(0x1021)

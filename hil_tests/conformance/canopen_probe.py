@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from binascii import crc_hqx
 from collections.abc import Callable, Collection
 from enum import IntEnum
 from typing import Any, Final, TypeVar
@@ -10,7 +11,7 @@ from typing import Any, Final, TypeVar
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from starhil.hil_tests.conformance.attitude_cases import TruthSource
-from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check_equal
+from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check, check_equal
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge.canopen import (
     ABORT,
@@ -87,14 +88,13 @@ class Abort(IntEnum):
     VALUE_LOW = 0x06090032
     GENERAL = 0x08000000
     NOT_STORED = 0x08000020
+    LOCAL_CONTROL = 0x08000021
     DEVICE_STATE = 0x08000022
     NO_DATA = 0x08000024
 
 
 VALUE_ABORTS: Final = (Abort.VALUE, Abort.VALUE_HIGH, Abort.VALUE_LOW)
 """Abort codes with which a node may refuse a value."""
-RESTRICTED_IDS: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
-"""CAN IDs at both ends of the restricted ranges (CiA 301 7.3.5)."""
 WATCHED_NODE: Final = 0x05
 """Node ID of a simulated watched node; no other node on the bus may have it."""
 
@@ -261,10 +261,9 @@ class CanopenProbe:
 
     # SDO
 
-    def ask(self, request: str | bytes, timeout_s: float | None = None) -> bytes | None:
+    def ask(self, request: bytes, timeout_s: float | None = None) -> bytes | None:
         """Send an SDO request, padded to 8 bytes; return the answer, or None."""
-        data = bytes.fromhex(request) if isinstance(request, str) else request
-        self.send_request(data)
+        self.send_request(request)
         return self.wait_for(SDO_RESPONSE + self.node, timeout_s)
 
     def send_request(self, data: bytes) -> None:
@@ -278,16 +277,10 @@ class CanopenProbe:
         self.send_request(b"\x80" + self._multiplexer + bytes.fromhex("00000008"))
         self.drain()
 
-    def expect_answer(self, request: str | bytes, answer: str) -> bytes:
-        """Fail unless an SDO request gets this answer; its form is that of `check_answer`."""
-        seen = self.ask(request)
-        check_answer(seen, answer)
-        return seen or b""
-
-    def expect_abort(self, request: str | bytes, *codes: int) -> None:
-        """Fail unless an SDO request is aborted with one of the codes and its own multiplexer."""
-        data = bytes.fromhex(request) if isinstance(request, str) else request
-        check_abort(self.ask(data), *codes, multiplexer=data[1:4].hex())
+    def expect_unreadable(self, index: int, subindex: int, *codes: int) -> None:
+        """Fail unless a read is aborted with one of the codes."""
+        request = upload_request(index, subindex)
+        check_abort(self.ask(request), *codes, multiplexer=request[1:].hex())
 
     def value(self, item: ODVariable | Entry) -> bytes:
         """Read an object of the EDS or of the definition."""
@@ -313,6 +306,35 @@ class CanopenProbe:
         except BadResponseError as error:
             raise CaseFailed(error.expected, _seen(error.seen)) from None
 
+    def upload_blocks(self, mux: bytes, block: int, *, crc: bool = True) -> bytes:
+        """Read an object by block upload with this many segments in a block, checking every part of the protocol."""
+        response = SDO_RESPONSE + self.node
+        self.send_request(bytes([0xA4 if crc else 0xA0]) + mux + bytes([block]))
+        begun = self.expect(response, "answer to the block upload")
+        check(begun[0] & 0xF9 == 0xC0, "answer C0h to C6h", begun)
+        check_equal(begun[1:4], mux, "multiplexer")
+        data, request, is_last = b"", b"\xa3", False
+        while not is_last:
+            self.send_request(request)
+            number = 0
+            while number < block and not is_last:
+                number += 1
+                frame = self.expect(response, f"segment {number} of the block")
+                check_equal(frame[0] & 0x7F, number, "segment number")
+                data, is_last = data + frame[1:], frame[0] > 0x7F
+            request = bytes([0xA2, number, block])
+        self.send_request(request)
+        end = self.expect(response, "end of the block upload")
+        check(end[0] & 0xE3 == 0xC1, "end C1h to DDh", end)
+        data = data[: len(data) - (end[0] >> 2 & 7)]
+        if begun[0] & 0x02:
+            check_equal(len(data), int.from_bytes(begun[4:], "little"), "bytes")
+        if begun[0] & 0x04 and crc:
+            check_equal(int.from_bytes(end[1:3], "little"), crc_hqx(data, 0), "CRC")
+        self.send_request(b"\xa1")
+        self.expect_silence(response, "answer to the end of an upload", 0.05)
+        return data
+
     def number(self, index: int, subindex: int = 0) -> int:
         """Read an unsigned number."""
         return int.from_bytes(self.read(index, subindex), "little")
@@ -332,9 +354,9 @@ class CanopenProbe:
         if code:
             raise CaseFailed(f"{index:04X}h:{subindex:02X}h taken", f"abort 0x{code:08X}")
 
-    def expect_refusal(self, index: int, subindex: int, value: int | bytes, size: int, *codes: int) -> None:
+    def expect_refusal(self, index: int, subindex: int, data: bytes, *codes: int) -> None:
         """Fail unless a write is refused with one of the codes."""
-        code = self.write(index, subindex, value, size)
+        code = self.write(index, subindex, data)
         if code not in codes:
             names = " or ".join(f"0x{wanted:08X}" for wanted in codes)
             raise CaseFailed(f"abort {names}", f"abort 0x{code:08X}" if code else "the value accepted")
@@ -345,12 +367,6 @@ class CanopenProbe:
         """Send an NMT command."""
         self.send(NMT, bytes([specifier, self.node if node is None else node]))
 
-    def command_and_settle(self, specifier: int) -> None:
-        """Send an NMT command, and discard the frames that the node sent before it obeyed."""
-        self.command(specifier)
-        self.wait_for(NOBODY, SETTLING_S)
-        self.drain()
-
     def state(self) -> int:
         """Return the state in the next heartbeat, after frames in transit have arrived."""
         self.wait_for(NOBODY, SETTLING_S)
@@ -360,12 +376,6 @@ class CanopenProbe:
     def send_watched_heartbeat(self) -> None:
         """Send a heartbeat of the watched node, in OPERATIONAL."""
         self.send(HEARTBEAT + WATCHED_NODE, b"\x05")
-
-    def reset_communication(self) -> None:
-        """Reset the communication to its stored values and wait for the boot-up message."""
-        self.drain()
-        self.command(RESET_COMMUNICATION)
-        self.expect_boot_up()
 
     def reset_to_stored_values(self) -> None:
         """Bring the node to PRE-OPERATIONAL with its stored values.
@@ -396,14 +406,8 @@ class CanopenProbe:
 
     def emergency_id(self) -> int:
         """Read the CAN ID of EMCY; skip the case if the node has none."""
-        self.require(0x1014)
+        self.require("1014")
         return self.number(0x1014) & 0x7FF
-
-    def expect_emergency(self, can_id: int, code: int, timeout_s: float | None = None) -> bytes:
-        """Take the next EMCY, which must have an error code."""
-        data = self.expect(can_id, f"EMCY {code:04X}h", timeout_s)
-        check_equal(data[:2], code.to_bytes(2, "little"), "error code")
-        return data
 
     # Content of the dictionary
 
@@ -420,10 +424,12 @@ class CanopenProbe:
                 found += [item.subindices[subindex] for subindex in sorted(item.subindices)]
         return found
 
-    def has(self, index: int, subindex: int) -> bool:
-        """Return whether the EDS has an entry of a record."""
-        record = self.od.indices.get(index)
-        return record is not None and not isinstance(record, ODVariable) and subindex in record.subindices
+    def lacks(self, entry: str) -> bool:
+        """Return whether the EDS lacks an object or entry, `INDEX` or `INDEX:SUBINDEX` in hexadecimal."""
+        index, _, subindex = entry.partition(":")
+        item = self.od.get(int(index, 16))
+        members = {0} if isinstance(item, ODVariable) else getattr(item, "subindices", {})
+        return item is None or bool(subindex and int(subindex, 16) not in members)
 
     def find(self, what: str, wanted: Callable[[ODVariable], bool]) -> ODVariable:
         """Return the first variable that is wanted; skip the case if there is none."""
@@ -432,16 +438,12 @@ class CanopenProbe:
                 return item
         raise CaseSkipped(f"the EDS has no {what}")
 
-    def require(self, *objects: int | str) -> None:
-        """Skip the case if an object, or an entry given as `INDEX:SUBINDEX` in hexadecimal, is missing."""
-        for item in objects:
-            index, _, subindex = (
-                f"{item:04X}".partition(":") if isinstance(item, int) else item.partition(":")
+    def require(self, *entries: str) -> None:
+        """Skip the case if an object or entry is missing."""
+        for entry in filter(self.lacks, entries):
+            raise CaseSkipped(
+                f"the EDS has no object {entry.replace(':', 'h:', 1) if ':' in entry else entry + 'h'}"
             )
-            if int(index, 16) not in self.od:
-                raise CaseSkipped(f"the EDS has no object {index}h")
-            if subindex and not self.has(int(index, 16), int(subindex, 16)):
-                raise CaseSkipped(f"the EDS has no object {index}h:{subindex}")
 
     def pdo_indices(self, first: int) -> list[int]:
         """Return the indices of communication records from 1400h or 1800h on."""

@@ -2,33 +2,63 @@
 
 from __future__ import annotations
 
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
-from starhil.hil_tests.conformance import (
-    canopen_eds,
-    canopen_emcy,
-    canopen_nmt,
-    canopen_od,
-    canopen_pdo,
-    canopen_sdo,
-    canopen_store_lss,
-)
-from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
+from starhil.hil_tests.conformance import canopen_eds, canopen_od
+from starhil.hil_tests.conformance.canopen_dialogue import dialogue_cases
+from starhil.hil_tests.conformance.canopen_probe import NO_RTR, PDO_OFF, START, CanopenProbe
 from starhil.hil_tests.conformance.canopen_unit import canopen_unit_cases
-from starhil.hil_tests.conformance.case import Case, cases_of
+from starhil.hil_tests.conformance.case import Case, CaseArea, cases_of, check, check_equal
+from starhil.hil_tests.judge.canopen import SYNC
 from starhil.hil_tests.judge.definition import Unit
 
-CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = tuple(
-    cases_of(
-        canopen_eds, canopen_nmt, canopen_sdo, canopen_od, canopen_emcy, canopen_pdo, canopen_store_lss
-    )
+DESIGN: Final = CaseArea[CanopenProbe]("canopen.design", "interface definition: canopen.toml", intrusive=True)
+"""Behaviour of this product beyond CiA 301."""
+
+
+@DESIGN.case("attitude", "TPDOs with the same sequence number are of one sample")
+def attitude(probe: CanopenProbe) -> None:
+    marker = probe.find("object named sequence", lambda item: item.name == "sequence" and item.pdo_mappable)
+    chosen: list[int] = []
+    probe.quiet()
+    for index in probe.pdo_indices(0x1800):
+        mapped = probe.number(index + 0x200, 0) and probe.number(index + 0x200, 1) >> 8
+        if mapped == marker.index << 8 | marker.subindex:
+            probe.set(index, 2, 1, 1)
+            can_id = 0x3E0 + len(chosen)
+            probe.set(index, 1, PDO_OFF | NO_RTR | can_id)
+            probe.set(index, 1, NO_RTR | can_id)
+            chosen.append(can_id)
+    check(len(chosen) >= 2, "two TPDOs that begin with the sequence number", len(chosen))
+    probe.command(START)
+    for _ in range(5):
+        probe.drain()
+        probe.send(SYNC)
+        heads = {probe.expect(can_id, "TPDO")[:2] for can_id in chosen}
+        check_equal(len(heads), 1, "sequence numbers and flags after one SYNC:")
+
+
+def _dialogues(name: str) -> list[Case[CanopenProbe]]:
+    return dialogue_cases(Path(__file__).with_name(f"canopen_{name}_cases.toml"))
+
+
+CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
+    *cases_of(canopen_eds), *_dialogues("nmt"), *_dialogues("sdo"), *cases_of(canopen_od), *_dialogues("emcy"),
+    *_dialogues("pdo"), *DESIGN.cases, *_dialogues("store"), *_dialogues("lss"),
 )  # fmt: skip
 """Cases of CiA 301, for any unit."""
 
 
-def canopen_suite(unit: Unit) -> tuple[Case[CanopenProbe], ...]:
-    """Return the cases for a unit on CANopen.
+def canopen_suite(unit: Unit) -> tuple[Case[Any], ...]:
+    """Return the cases for a unit on CANopen, with those of its own files, which replace any with the same ID.
 
-    Raises IcdError: the unit has no CANopen node.
+    Raises IcdError: the unit has no CANopen node. Raises BenchError: a file has errors.
     """
-    return (*CANOPEN_CASES, *canopen_unit_cases(unit))
+    files = sorted(unit.folder.glob("*_cases.toml")) if unit.folder is not None else ()
+    found = (
+        *CANOPEN_CASES,
+        *canopen_unit_cases(unit),
+        *(case for path in files for case in dialogue_cases(path)),
+    )
+    return tuple({case.id: case for case in found}.values())

@@ -23,10 +23,10 @@ from starhil.hil_tests.conformance.canopen_probe import (
 )
 from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal
 from starhil.hil_tests.conformance.link_probe import checked_values
-from starhil.hil_tests.conformance.pdo_setup import SYNCHRONOUS, send_sync
 from starhil.hil_tests.conformance.row_cases import CLOCK_S
 from starhil.hil_tests.judge.canopen import (
     EXPEDITED,
+    SYNC,
     Entry,
     entries,
     is_text,
@@ -266,7 +266,7 @@ def _limits(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
 
 def _refused(entry: Entry, data: bytes, probe: CanopenProbe) -> None:
     before = probe.value(entry) if entry.row is not None else b""
-    probe.expect_refusal(entry.index, entry.subindex, data, len(data), *VALUE_ABORTS)
+    probe.expect_refusal(entry.index, entry.subindex, data, *VALUE_ABORTS)
     if entry.row is not None:
         check_equal(probe.value(entry), before, f"{entry.name}h, unchanged:")
 
@@ -321,7 +321,7 @@ def _default(index: int, model: Any, mapped: list[Entry], probe: CanopenProbe) -
 def _carries_values(index: int, mapped: list[Entry], probe: CanopenProbe) -> None:
     probe.quiet()
     can_id = probe.number(index, 1) & 0x7FF or UNUSED_ID
-    probe.set(index, 2, SYNCHRONOUS, 1)
+    probe.set(index, 2, 1, 1)
     probe.set(index, 1, NO_RTR | can_id)
     probe.command(START)
 
@@ -331,7 +331,7 @@ def _carries_values(index: int, mapped: list[Entry], probe: CanopenProbe) -> Non
     for _ in range(10):  # until nothing has changed between the readings
         before = read()
         probe.drain()
-        send_sync(probe)
+        probe.send(SYNC)
         data, after = probe.expect(can_id, "TPDO after a SYNC"), read()
         if before == after:
             break

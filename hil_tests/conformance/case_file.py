@@ -6,14 +6,14 @@
     [[area]]
     name = "errors"
     clause = "ICD 4.3"
-    links = ["serial"]                          # default: serial and can
+    links = ["serial"]                          # default: serial and can; for canopen, see `canopen_dialogue`
     intrusive = true                            # default: false
     cases = [
         { id = "junk", title = "junk sets a flag", lines = "{clear}; 00 55; silence; telemetry status junk=true" },
     ]
 
 `clause` and `intrusive` of a case replace those of its area; a case with a name in braces that the unit lacks is left out.
-The steps of `lines` are separated by semicolons:
+The steps of `lines` are separated by semicolons or stand in lines of their own:
 
     1F 7F 80 1F FF > 128        raw bytes, and the next answers: telemetry rows by ID
     1F 7F 03 1F FF > 3!crc      ... or a refusal by an error's name
@@ -36,13 +36,16 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from starhil.hil_tests.conformance.case import Case, case_in, check_equal
 from starhil.hil_tests.conformance.link_probe import LinkProbe
 from starhil.hil_tests.errors import BenchError
+from starhil.protocol.errors import reason
+from starhil.protocol.user_file import read_user_text
+from starhil.protocol.validation_messages import problems
 
 CUBESPACE_CASES: Final = Path(__file__).with_name("cubespace_cases.toml")
 REPEATED: Final = re.compile(r"\(([^()]*)\)\*(\d+)")
@@ -67,7 +70,7 @@ class AreaText(_Model):
 
     name: str
     clause: str
-    links: list[str] = ["serial", "can"]
+    links: list[Literal["serial", "can", "canopen"]] = ["serial", "can"]
     intrusive: bool = False
     cases: list[CaseText]
 
@@ -96,17 +99,17 @@ def read_case_file(path: Path) -> CaseFile:
     Raises BenchError: it is not one; the text names all errors.
     """
     try:
-        return CaseFile.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+        document = tomllib.loads(read_user_text(path))
+        return CaseFile.model_validate(document)
     except ValidationError as error:
-        found = (f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors())
-        raise BenchError(f"{path}: {'; '.join(found)}") from None
+        raise BenchError(*(f"{path}: {item}" for item in problems(error, CaseFile, document))) from None
     except (OSError, ValueError) as error:
-        raise BenchError(f"{path}: {error}") from None
+        raise BenchError(f"{path}: {reason(error)}") from None
 
 
 def hold(lines: str, probe: LinkProbe) -> None:
     """Carry out the steps of a case."""
-    for step in REPEATED.sub(lambda found: found[1] * int(found[2]), lines).split(";"):
+    for step in re.split("[;\n]", REPEATED.sub(lambda found: found[1] * int(found[2]), lines.strip())):
         match step.split():
             case "silence", *seconds:
                 probe.expect_silence("nothing was requested", float(seconds[0]) if seconds else None)

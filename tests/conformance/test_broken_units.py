@@ -20,30 +20,35 @@ UNREADABLE = (
     (
         Mutant("empty heartbeat", "error-control", "error_control", "bytes([self._context.state]))\n            self._next", 'b"")\n            self._next'),
         "canopen.nmt.commands",
+        "an answer that can be read",
         "72C# (IndexError",
     ),
     (
         Mutant("EMCY of 2 bytes", "emcy", "emergency", "MESSAGE.build(fields)", "MESSAGE.build(fields)[:2]"),
         "canopen.emcy.history-order",
-        "(IndexError",
+        "bytes of EMCY 8 ",
+        "2",
     ),
     (
         Mutant("SYNC without its counter", "sync", "sync", 'bytes([self._counter]) if overflow else b""', 'b""'),
         "canopen.sync.producer",
-        "080# (IndexError",
+        "data ['01', '02', '03', '01', '02'] ",
+        "['', '', '', '', '']",
     ),
 )  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("mutant", "caught_by", "seen"), UNREADABLE, ids=lambda item: getattr(item, "name", "")
+    ("mutant", "caught_by", "expected", "seen"), UNREADABLE, ids=lambda item: getattr(item, "name", "")
 )
-def test_frames_that_cannot_be_parsed_fail_their_cases_and_the_run_continues(mutant, caught_by, seen):
+def test_frames_that_cannot_be_parsed_fail_their_cases_and_the_run_continues(
+    mutant, caught_by, expected, seen
+):
     outcomes = run_cases(simulated_probe(load(mutant)), CANOPEN_CASES)
     assert [outcome.id for outcome in outcomes] == [case.id for case in CANOPEN_CASES]
     caught = next(outcome for outcome in outcomes if outcome.id == caught_by)
     assert caught.status == "failed"
-    assert caught.expected == "an answer that can be read"
+    assert caught.expected.startswith(expected)
     assert seen in caught.seen
 
 

@@ -160,10 +160,10 @@ def test_cases_in_a_text_file_are_run_on_their_link(tmp_path: Path) -> None:
     [
         (
             "[[area]]\nname = 1\n",
-            r"area\.0\.name: Input should be a valid string; area\.0\.clause: Field required",
+            r"area\.0\.name: must be a text .*; .*area\.0\.clause: missing",
         ),
         ("area = [", "Invalid"),
-        ("[[row]]", "row: Extra inputs are not permitted"),
+        ("[[row]]", "row: unknown key"),
     ],
 )
 def test_a_text_file_of_cases_with_errors_is_named(text: str, error: str, tmp_path: Path) -> None:

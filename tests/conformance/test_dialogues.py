@@ -1,0 +1,143 @@
+"""Files `*_cases.toml` of a unit add cases on CANopen; an error in one is located."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from starhil.hil_tests.conformance.canopen_dialogue import dialogue_cases
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, canopen_suite
+from starhil.hil_tests.conformance.runner import run_case, run_cases
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.judge.definition import read_unit
+from starhil.protocol.names import find_unit
+from tests.conformance.simulated import SimulatedUnit
+
+DOCS = (Path(__file__).parents[2] / "docs" / "units.md").read_text(encoding="utf-8")
+EXAMPLE = next(block.split("```")[0] for block in DOCS.split("```toml\n") if block.startswith("[[area]]"))
+AREA = '[[area]]\nname = "modes"\nlinks = ["canopen"]\nclause = "ICD 4.2"\n'
+OWN = (
+    AREA
+    + """
+[[area.cases]]
+id = "wrong"
+title = "a value that was not written"
+lines = '''
+set 1017:0 555 u16
+holds 1017:0 1 u16
+set 1017:0 111 u16
+finally
+set 1017:0 777 u16
+holds 1017:0 2 u16
+'''
+
+[[area]]
+name = "nmt"
+links = ["canopen"]
+clause = "ICD 4.3"
+
+[[area.cases]]
+id = "boot-up"
+title = "this unit boots in a way of its own"
+clause = "ICD 4.4"
+lines = "40 00 10 00 > 43 *"
+"""
+)
+
+
+def case_file(folder: Path, dialogue: str) -> Path:
+    path = folder / "modes_cases.toml"
+    path.write_text(
+        f"{AREA}[[area.cases]]\nid = 'one'\ntitle = 'One'\nlines = '''\nneed 1017\n{dialogue}\n'''\n"
+    )
+    return path
+
+
+def test_dialogues_of_a_unit_are_run_with_the_other_cases(tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(find_unit("oresat"), tmp_path / "unit"))
+    (folder / "modes_cases.toml").write_text(OWN, encoding="utf-8")
+    (folder / "filter_cases.toml").write_text(EXAMPLE, encoding="utf-8")
+    cases = {case.id: case for case in canopen_suite(read_unit(folder))}
+    plain = {case.id for case in canopen_suite(read_unit("oresat"))}
+    assert cases.keys() - plain == {"canopen.filter.kept", "canopen.modes.wrong"}
+    own = [cases[f"canopen.{name}"] for name in ("filter.kept", "nmt.boot-up", "modes.wrong")]
+    assert [(case.clause, case.intrusive) for case in own] == [
+        ("ICD 4.5", True),
+        ("ICD 4.4", False),
+        ("ICD 4.2", False),
+    ]
+    with SimulatedUnit("canopen", unit=folder) as simulated:
+        passed, replaced, failed = run_cases(simulated.probe, own)
+    assert [item.status for item in (passed, replaced, failed)] == ["passed", "passed", "failed"], passed
+
+
+def test_the_lines_after_finally_are_held_after_a_failure_which_is_reported(tmp_path: Path) -> None:
+    path = tmp_path / "modes_cases.toml"
+    path.write_text(OWN, encoding="utf-8")
+    case = next(case for case in dialogue_cases(path) if case.id == "canopen.modes.wrong")
+    with SimulatedUnit("canopen") as simulated:
+        outcome = run_case(simulated.probe, case)
+        assert simulated.probe.number(0x1017) == 777
+    assert outcome.expected == "1017h:00h 1 (step 2: holds 1017:0 1 u16, after set 1017:0 555 u16)"
+    assert outcome.seen == "555"
+
+
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        ("sett 1017:0 5 u16", "unknown verb 'sett'; did you mean set"),
+        ("40 {txt} > *", "unknown name 'txt'; did you mean text"),
+        ("40 {text} > sometimes", "unknown answer 'sometimes'"),
+        ("40 {text} > abort TOGLE", "40 {text} > abort TOGLE: 'TOGLE'"),
+        ("set 1017:0", "missing a required argument: 'values'"),
+        ("set 1017:0 70000 u16", "int too big to convert"),
+        ("set 1017 5 u16", "not enough values to unpack"),
+        ("set 1017:0 5 f32", "unknown kind 'f32'"),
+        ("if 10 set 1017:0 5 u16", "'10' is not INDEX or INDEX:SUBINDEX"),
+        ("nmt start", "invalid literal for int"),
+        ("sleep 0.1 0.2", "too many positional arguments"),
+        ("drain > VALUES", "nothing may follow >"),
+        ("map {tpdo} 1 evnt=5", "unknown setting 'evnt'"),
+    ],
+)
+def test_an_error_in_a_line_names_file_case_and_line(line: str, fault: str, tmp_path: Path) -> None:
+    with pytest.raises(BenchError) as caught:
+        dialogue_cases(case_file(tmp_path, line))
+    assert str(caught.value).startswith(f"{tmp_path}/modes_cases.toml: modes.one: line 2: ")
+    assert fault in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        ("clause =", "claus =", "area.modes.claus: unknown key; did you mean clause"),
+        (
+            '["canopen"]',
+            '["can_open"]',
+            "area.modes.links.0: must be one of 'serial', 'can', 'canopen' (given: 'can_open')",
+        ),
+        ("title = 'One'", "", "area.modes.cases.one.title: missing"),
+        ("[[area]]", "[[area]", "Expected ']]'"),
+    ],
+)
+def test_an_error_in_a_file_is_located(old: str, new: str, fault: str, tmp_path: Path) -> None:
+    path = case_file(tmp_path, "drain")
+    path.write_text(path.read_text().replace(old, new))
+    with pytest.raises(BenchError) as caught:
+        dialogue_cases(path)
+    assert str(path) in str(caught.value)
+    assert fault in str(caught.value)
+
+
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BenchError, match=r"none_cases\.toml: No such file"):
+        dialogue_cases(tmp_path / "none_cases.toml")
+
+
+def test_cases_for_any_unit_are_in_order_of_their_areas() -> None:
+    areas = list(dict.fromkeys(case.area.removeprefix("canopen.") for case in CANOPEN_CASES))
+    assert areas == [
+        "eds", "nmt", "error-control", "sync", "time", "sdo", "sdo-block", "od", "emcy", "tpdo", "rpdo", "design", "store", "lss",
+    ]  # fmt: skip
