@@ -8,7 +8,7 @@ from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.cob import SDO_RECEIVE, SDO_TRANSMIT
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import ERROR_OF_ABORT, SdoTransfer, row_transfer
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
@@ -29,7 +29,7 @@ class CanopenHostLink(HostLink[CanFrame]):
     ) -> None:
         super().__init__(open_can(spec), f"CANopen {spec}", log, lambda: self)
         self._icd = icd
-        self._dictionary = build_dictionary(icd)
+        self._dictionary = DeviceDictionary(icd)
         self._node = int(icd.device_parameters["canopen_node"].default) if node is None else node
         self._under_way: tuple[Request, SdoTransfer] | None = None
 

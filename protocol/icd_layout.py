@@ -148,21 +148,19 @@ class Layout:
         if model.name is None and (model.value or model.argument or model.const is not None):
             raise IcdError("a field with a value, argument or const needs a name")
         given = vars(model)
-        limits_of_const = {} if model.const is None else {"minimum": model.const, "maximum": model.const}
-        return (
-            {key: given[key] for key in _KEPT}
-            | limits_of_const
-            | {
-                "kind": "unused" if model.name is None else kind,
-                "slot": slot,
-                "width": width,
-                "enum": enum,
-                "aliases": aliases,
-                "default": _default(model.default, enum),
-                "value": _numbered(model.value, number),
-                "argument": _numbered(model.argument, number),
-            }
-        )
+        keys = {key: given[key] for key in _KEPT}
+        if model.const is not None:
+            keys |= {"minimum": model.const, "maximum": model.const}
+        return keys | {
+            "kind": "unused" if model.name is None else kind,
+            "slot": slot,
+            "width": width,
+            "enum": enum,
+            "aliases": aliases,
+            "default": _default(model.default, enum),
+            "value": _numbered(model.value, number),
+            "argument": _numbered(model.argument, number),
+        }
 
     def _faults(
         self, model: FieldModel | BitModel, limits: tuple[int, int] | None, described: str

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
+from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
@@ -113,7 +114,7 @@ def examine(
     if not errors:
         try:
             if definition.canopen is not None:
-                build_dictionary(definition)
+                build_eds(DeviceDictionary(definition))
             examples += exchanges(definition)
         except ProtocolError as error:
             errors.append(f"{path}: {error}")

@@ -34,7 +34,7 @@ from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.private_can_bus import hub_thread, private_can_bus
 from starhil.hil_tests.raw_traffic import parse_frame
 from starhil.protocol.can_framing import CanFrame, MessageType
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.export import export
 from starhil.protocol.icd import load_unit
 from starid.attitude import Attitude
@@ -263,11 +263,11 @@ def test_canopen_names_every_object_of_the_device():
         for place in places.split(", "):
             first, _, last = place.replace("h", "").partition("–")
             named |= set(range(int(first, 16), int(last or first, 16) + 1))
-    assert named == {index for index in build_dictionary(load_unit()).od.indices if index >= 0x2000}
+    assert named == {index for index in DeviceDictionary(load_unit()).od.indices if index >= 0x2000}
 
 
 def test_canopen_shows_the_pdos_as_they_are():
-    od = build_dictionary(load_unit()).od
+    od = DeviceDictionary(load_unit()).od
     for title, identifier, content in table_after("canopen.md", "Attitude by PDO")[:4]:
         number = int(title.split()[0]) - 1
         mapping = od[0x1A00 + number]

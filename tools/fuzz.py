@@ -35,7 +35,7 @@ SLOWEST_S = 20
 MEMORY_MB = 3000
 CORPUS_BYTES = 3000
 INSTRUMENTED = (
-    "starhil.protocol", "starhil.hil_tests.script", "starhil.hil_tests.expect",
+    "starhil.protocol", "starhil.hil_tests.script", "starhil.hil_tests.steps", "starhil.hil_tests.expect",
     "starhil.hil_tests.images", "starhil.hil_tests.raw_traffic", "starhil.hil_tests.truth_log",
     "starhil.hil_tests.emulator_process", "starhil.emulator.control", "starhil.emulator.console",
     "starhil.emulator.device", "starhil.emulator.truth", "starhil.emulator.profile",

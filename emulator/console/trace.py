@@ -12,7 +12,7 @@ from starhil.emulator.links.traffic import Decoder, Traffic, WireItem
 from starhil.protocol.can_framing import CanFrame, encode_request_frames
 from starhil.protocol.candump import bus_name, format_candump
 from starhil.protocol.canopen.cob import SDO_RECEIVE
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import requests_of, row_transfer
 from starhil.protocol.codec import Row
 from starhil.protocol.cubespace import Dialect
@@ -105,7 +105,7 @@ class RequestEncoder:
     def __init__(self, icd: InterfaceDefinition) -> None:
         self._icd = icd
         self._stack = SerialStack(icd) if icd.link.serial is not None else None
-        self._objects = build_dictionary(icd) if icd.canopen_only else None
+        self._objects = DeviceDictionary(icd) if icd.canopen_only else None
 
     def encode(self, row: Row, data: bytes, host: int, device: int) -> dict[str, Any]:
         """Return a request as data and serial bytes in hexadecimal, and as arguments of cansend.

@@ -25,7 +25,7 @@ from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
 from starhil.protocol.canopen.cob import SDO_RECEIVE
 from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
@@ -181,7 +181,7 @@ class CanopenLink(BusLink[CanFrame]):
         super().__init__(requests, transport, CanDamage(extended=False), seed)
         device = self._device
         self.application = DeviceApplication(requests, self._finish_write)
-        dictionary = build_dictionary(device.icd, self.application)
+        dictionary = DeviceDictionary(device.icd, self.application)
         self.slave = CanopenSlave(
             dictionary,
             self._wanted_node,

@@ -94,7 +94,7 @@ from starhil.hil_tests.conformance.case import (
 )
 from starhil.hil_tests.conformance.case_file import read_case_file
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.judge.canopen import ABORT, HEARTBEAT, SDO_RESPONSE, SEGMENT, SYNC, upload_request
+from starhil.hil_tests.judge.canopen import ABORT, HEARTBEAT, SDO_RESPONSE, SEGMENT, SYNC
 from starhil.protocol.names import did_you_mean
 
 LONGEST_TIMEOUT_S: Final = 12.0
@@ -395,13 +395,13 @@ class _Master:
     def set(self, entry: Entry, values: str, kind: str = "", *, refused: Aborts = ()) -> None:
         for data in _data_of(values, kind):
             if refused:
-                self._probe.expect_refusal(*entry, data, len(data), *refused)
+                self._probe.expect_refusal(*entry, data, *refused)
             else:
                 self._probe.set(*entry, data)
 
     def read(self, entry: Entry, *, refused: Aborts = ()) -> None:
         if refused:
-            self._probe.expect_abort(upload_request(*entry), *refused)
+            self._probe.expect_unreadable(*entry, *refused)
         else:
             self._probe.read(*entry)
 

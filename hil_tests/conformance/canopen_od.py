@@ -9,7 +9,6 @@ from canopen.objectdictionary import ODVariable, datatypes
 
 from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, encoded, is_integer, size_of
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
-from starhil.hil_tests.judge.canopen import multiplexer
 
 OD: Final = CaseArea[CanopenProbe]("canopen.od", "CiA 301 7.2.4.3.17", intrusive=True)
 NOT_NOW = {Abort.NO_DATA, Abort.GENERAL, Abort.DEVICE_STATE, Abort.NOT_STORED}
@@ -89,22 +88,20 @@ def write_only(probe: CanopenProbe) -> None:
     probe.find("write-only object", lambda item: item.access_type == "wo")
     for item in probe.variables():
         if item.access_type == "wo":
-            probe.expect_abort(b"\x40" + multiplexer(item.index, item.subindex), Abort.WRITE_ONLY)
+            probe.expect_unreadable(item.index, item.subindex, Abort.WRITE_ONLY)
 
 
 @OD.case("read-only", "read-only and constant objects cannot be written")
 def read_only(probe: CanopenProbe) -> None:
     for item in probe.variables():
-        if item.access_type in {"ro", "const"}:
-            size = min(size_of(item) or 1, 4)
-            command = bytes([0x23 | (4 - size) << 2])
-            if size_of(item) in {1, 2, 4}:
-                probe.expect_abort(command + multiplexer(item.index, item.subindex), Abort.READ_ONLY)
+        size = size_of(item) or 0
+        if item.access_type in {"ro", "const"} and size in {1, 2, 4}:
+            probe.expect_refusal(item.index, item.subindex, bytes(size), Abort.READ_ONLY)
 
 
 def _check_missing(probe: CanopenProbe, index: int, subindex: int, code: Abort) -> None:
-    for command in (0x40, 0x2F):
-        probe.expect_abort(bytes([command]) + multiplexer(index, subindex), code)
+    probe.expect_unreadable(index, subindex, code)
+    probe.expect_refusal(index, subindex, b"\0", code)
 
 
 @OD.case("no-object", "objects that are not in the EDS do not exist")
@@ -130,8 +127,7 @@ def _wrong_length(longer: int, code: Abort, probe: CanopenProbe) -> None:
         size = (size_of(item) or 0) + longer
         signature = longer > 0 and item.index in {0x1010, 0x1011}
         if item.writable and 1 + (longer > 0) <= size <= 4 and not signature:
-            command = bytes([0x23 | (4 - size) << 2])
-            probe.expect_abort(command + multiplexer(item.index, item.subindex), Abort.LENGTH, code)
+            probe.expect_refusal(item.index, item.subindex, bytes(size), Abort.LENGTH, code)
 
 
 for _name, _word, _longer, _code in (
@@ -159,7 +155,7 @@ def _beyond_limits(step: int, code: Abort, probe: CanopenProbe) -> None:
         lowest, highest = (-(1 << 8 * size - 1) if signed else 0), (1 << 8 * size - signed) - 1
         if limit is not None and lowest <= int(limit) + step <= highest:
             data = encoded(item, int(limit) + step)
-            probe.expect_refusal(item.index, item.subindex, data, size, code, Abort.VALUE)
+            probe.expect_refusal(item.index, item.subindex, data, code, Abort.VALUE)
 
 
 for _name, _word, _step, _code in (

@@ -260,10 +260,9 @@ class CanopenProbe:
 
     # SDO
 
-    def ask(self, request: str | bytes, timeout_s: float | None = None) -> bytes | None:
+    def ask(self, request: bytes, timeout_s: float | None = None) -> bytes | None:
         """Send an SDO request, padded to 8 bytes; return the answer, or None."""
-        data = bytes.fromhex(request) if isinstance(request, str) else request
-        self.send_request(data)
+        self.send_request(request)
         return self.wait_for(SDO_RESPONSE + self.node, timeout_s)
 
     def send_request(self, data: bytes) -> None:
@@ -277,16 +276,10 @@ class CanopenProbe:
         self.send_request(b"\x80" + self._multiplexer + bytes.fromhex("00000008"))
         self.drain()
 
-    def expect_answer(self, request: str | bytes, answer: str) -> bytes:
-        """Fail unless an SDO request gets this answer; its form is that of `check_answer`."""
-        seen = self.ask(request)
-        check_answer(seen, answer)
-        return seen or b""
-
-    def expect_abort(self, request: str | bytes, *codes: int) -> None:
-        """Fail unless an SDO request is aborted with one of the codes and its own multiplexer."""
-        data = bytes.fromhex(request) if isinstance(request, str) else request
-        check_abort(self.ask(data), *codes, multiplexer=data[1:4].hex())
+    def expect_unreadable(self, index: int, subindex: int, *codes: int) -> None:
+        """Fail unless a read is aborted with one of the codes."""
+        request = upload_request(index, subindex)
+        check_abort(self.ask(request), *codes, multiplexer=request[1:].hex())
 
     def value(self, item: ODVariable | Entry) -> bytes:
         """Read an object of the EDS or of the definition."""
@@ -360,9 +353,9 @@ class CanopenProbe:
         if code:
             raise CaseFailed(f"{index:04X}h:{subindex:02X}h taken", f"abort 0x{code:08X}")
 
-    def expect_refusal(self, index: int, subindex: int, value: int | bytes, size: int, *codes: int) -> None:
+    def expect_refusal(self, index: int, subindex: int, data: bytes, *codes: int) -> None:
         """Fail unless a write is refused with one of the codes."""
-        code = self.write(index, subindex, value, size)
+        code = self.write(index, subindex, data)
         if code not in codes:
             names = " or ".join(f"0x{wanted:08X}" for wanted in codes)
             raise CaseFailed(f"abort {names}", f"abort 0x{code:08X}" if code else "the value accepted")
@@ -372,12 +365,6 @@ class CanopenProbe:
     def command(self, specifier: int, node: int | None = None) -> None:
         """Send an NMT command."""
         self.send(NMT, bytes([specifier, self.node if node is None else node]))
-
-    def command_and_settle(self, specifier: int) -> None:
-        """Send an NMT command, and discard the frames that the node sent before it obeyed."""
-        self.command(specifier)
-        self.wait_for(NOBODY, SETTLING_S)
-        self.drain()
 
     def state(self) -> int:
         """Return the state in the next heartbeat, after frames in transit have arrived."""

@@ -266,7 +266,7 @@ def _limits(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
 
 def _refused(entry: Entry, data: bytes, probe: CanopenProbe) -> None:
     before = probe.value(entry) if entry.row is not None else b""
-    probe.expect_refusal(entry.index, entry.subindex, data, len(data), *VALUE_ABORTS)
+    probe.expect_refusal(entry.index, entry.subindex, data, *VALUE_ABORTS)
     if entry.row is not None:
         check_equal(probe.value(entry), before, f"{entry.name}h, unchanged:")
 

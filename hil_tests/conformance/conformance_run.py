@@ -307,10 +307,10 @@ def _canopen_probe(request: ConformanceRequest, can: str, stack: ExitStack) -> C
 def _eds_text(request: ConformanceRequest) -> str:
     path = request.eds
     if path is None:
-        from starhil.protocol.canopen.device_dictionary import build_dictionary
+        from starhil.protocol.canopen.device_dictionary import DeviceDictionary
         from starhil.protocol.canopen.eds import build_eds
 
-        return build_eds(build_dictionary(load_unit(request.unit or DEFAULT_UNIT)))
+        return build_eds(DeviceDictionary(load_unit(request.unit or DEFAULT_UNIT)))
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:

@@ -26,6 +26,8 @@ SEQUENCE: Final = "sequence"
 
 SETTING_ACTIONS: Final = frozenset({None, "nothing", "set_parameters", "subscribe", "select_unsolicited"})
 """Actions of the device model that repeating a telecommand with the same data does not carry out again."""
+UNASKED: Final = frozenset({"unsolicited_rate", "unsolicited_selection"})
+"""Parameters that change what a unit sends unasked."""
 LONG_PAUSE_S: Final = 0.8
 """Pause after which the device has abandoned an incomplete message (after 0.5 s)."""
 LATE_S: Final = 1.0
@@ -70,21 +72,26 @@ class ReadableSettings:
     """Settings for any unit: the telecommands whose values a telemetry row reports, unless they do something once, such as a reset."""
 
     def __init__(self) -> None:
-        self._found: list[tuple[Row, bytes]] = []
+        self._found: list[tuple[Row, dict[str, Value]]] = []
 
     def prepare(self, probe: LinkProbe) -> None:
         """Record the settings."""
         kept = SETTING_ACTIONS.union(probe.unit.plugin.actions if probe.unit.plugin is not None else ())
-        self._found = [
-            (command, probe.data_of(row)[part])
-            for command, row, part in probe.unit.reported_data
-            if command.action in kept
-        ]
+        for command, row, places in probe.unit.reported:
+            if command.action in kept and not changes_link(probe.unit, command):
+                seen = probe.telemetry(row.name)
+                self._found.append((command, {name: seen[place] for name, place in places.items()}))
 
     def restore(self, probe: LinkProbe) -> None:
         """Restore the settings."""
-        for command, data in self._found:
-            probe.send_command(command, data)
+        for command, values in self._found:
+            probe.command(command.name, **values)
+
+
+def changes_link(unit: Unit, command: Row) -> bool:
+    """Return whether a telecommand sets how the unit is reached, or what it sends unasked."""
+    names = {item.parameter for item in command.named.values() if item.parameter is not None}
+    return any(name in UNASKED or unit.device_parameters[name].of_link for name in names)
 
 
 def lively_row(unit: Unit, can_refuse: Callable[[str], bool]) -> Row:

@@ -22,6 +22,7 @@ from starhil.hil_tests.conformance.link_probe import (
     INVALID_LENGTH,
     INVALID_PARAMETER,
     LinkProbe,
+    changes_link,
     checked_values,
 )
 from starhil.hil_tests.judge.definition import Unit
@@ -41,8 +42,6 @@ RESTING: Final = 5
 """Number of attempts to read two rows between two measurements."""
 F32_ROUNDING: Final = 1e-6
 CLOCK_S: Final = 1_700_000_000
-UNASKED: Final = frozenset({"unsolicited_rate", "unsolicited_selection"})
-"""Parameters that change what a unit sends unasked: no values are tried, nor of those that change how it is reached."""
 TIGHT: Final = frozenset({"delay_time", "orbit_eccentricity"})
 """Parameters that may only have the present value, because all others contradict the exposure, the update rate or the orbit."""
 PUBLISHED_IDS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
@@ -221,30 +220,16 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
         if row.action in (None, "nothing") or row.action in own:
             title = f"{row.name} is accepted"
             yield case_in("commands", row.name, title, partial(_accepted, row), row, intrusive=True)
-    for command, row, _ in unit.reported_data:
-        if command.action in (None, "nothing"):
-            title = f"{row.name} reports the bytes set by {command.name}"
-            run = partial(_set_and_read, command, row, {name: name for name in command.named}, marks)
-            alone = sum(other is row for _, other, _ in unit.reported_data) == 1
-            name = row.name if alone else f"{row.name}.{command.name}"
+    for command, row, places in unit.reported:
+        run = partial(_set_and_read, command, row, places, marks)
+        name = f"{row.name}.{command.name}"
+        if command.action == "set_parameters" and not changes_link(unit, command):
+            title = f"{row.name} reports the parameters set by {command.name}"
             yield case_in("settings", name, title, run, row, intrusive=True)
-    untried = UNASKED | {name for name, item in unit.device_parameters.items() if item.of_link}
-    for command in unit.telecommands.values():
-        fields = {_quantity(item): name for name, item in command.named.items() if item.parameter is not None}
-        if command.action != "set_parameters" or not fields or untried & {item[0] for item in fields}:
-            continue
-        for row in unit.telemetry.values():
-            places = {
-                fields[_quantity(item)]: name for name, item in row.named.items() if _quantity(item) in fields
-            }
-            if len(places) == len(fields):
-                title = f"{row.name} reports the parameters set by {command.name}"
-                run = partial(_set_and_read, command, row, places, marks)
-                yield case_in("settings", f"{row.name}.{command.name}", title, run, row, intrusive=True)
-
-
-def _quantity(item: Field) -> tuple[object, ...]:
-    return item.parameter, item.unit, item.kind, item.type, item.width, item.scale, item.bias
+        elif command.action in (None, "nothing"):
+            title = f"{row.name} reports the bytes set by {command.name}"
+            alone = sum(other is row for _, other, _ in unit.reported) == 1
+            yield case_in("settings", row.name if alone else name, title, run, row, intrusive=True)
 
 
 def _accepted(row: Row, probe: LinkProbe) -> None:

@@ -131,20 +131,31 @@ class Unit:
         return () if row.name in self.unanswered else row.answers
 
     @cached_property
-    def reported_data(self) -> tuple[tuple[Row, Row, slice], ...]:
-        """Each telecommand whose last data telemetry reports, the row that does, and which of its bytes they are."""
-        found = []
+    def reported(self) -> tuple[tuple[Row, Row, Mapping[str, str]], ...]:
+        """Each telecommand all of whose fields a telemetry row reports, the row, and the row's field for each of them.
+
+        The row includes the fields of the telecommand, or has the same parameters in the same layout.
+        """
+        found = {}
         for row in self.telemetry.values():
-            firsts = {
-                item.telecommand: item
-                for item in tuple(row.named.values())[::-1]
-                if item.telecommand is not None
-            }
-            for name, first in firsts.items():
+            for name in {
+                item.telecommand: None for item in row.named.values() if item.telecommand is not None
+            }:
                 command = self.telecommands[name]
-                start = first.offset - command.named[first.name].offset
-                found.append((command, row, slice(start, start + command.size)))
-        return tuple(found)
+                found[name, row.name] = command, row, {field: field for field in command.named}
+        for command in self.telecommands.values():
+            fields = {
+                item.of_parameter: item.name for item in command.named.values() if item.parameter is not None
+            }
+            for row in self.telemetry.values() if command.action == "set_parameters" and fields else ():
+                places = {
+                    fields[item.of_parameter]: item.name
+                    for item in row.named.values()
+                    if item.of_parameter in fields
+                }
+                if len(places) == len(fields):
+                    found[command.name, row.name] = command, row, places
+        return tuple(found.values())
 
     def request(self, row: Row | int, data: bytes = b"", klass: str = "") -> Request:
         """Return the request for a row, or for an ID, which need not belong to one."""

@@ -101,6 +101,11 @@ class Field:
         return (1e-9 if self.kind == "float" else 0.51) * abs(self.scale)
 
     @property
+    def of_parameter(self) -> tuple[object, ...]:
+        """Parameter and layout; fields that are alike in them carry the same numbers."""
+        return self.parameter, self.unit, self.kind, self.type, self.width, self.scale, self.bias
+
+    @property
     def type_limits(self) -> tuple[int, int]:
         """Lowest and highest raw number that the bits can hold."""
         bits = self.width or 8 * self.size

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import NoReturn, cast
+from typing import Final, NoReturn, cast
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
@@ -24,10 +24,13 @@ from starhil.protocol.canopen.communication import (
 )
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Entry, Value, encode, type_size
 from starhil.protocol.canopen.pdo_mapping import Direction, resolve_all
-from starhil.protocol.canopen_schema import CanopenModel, PackedField, PdoModel, PlacedMember, PlacedObject
+from starhil.protocol.canopen_schema import PackedField, PdoModel, PlacedMember, PlacedObject
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import IcdError, MessageError, Parameter, representable
+
+LARGEST_SUBINDEX: Final = 254
+"""Highest sub-index of a member (CiA 301: 255 is reserved)."""
 
 Key = tuple[int, int]
 """Index and sub-index."""
@@ -36,17 +39,17 @@ Named = tuple[Entry, Sequence[str]]
 
 
 class DeviceDictionary(Dictionary):
-    """Object dictionary of a device, built from its interface definition and the indices of its layout.
+    """Object dictionary of a device, built from its interface definition and the layout in it.
 
     Without an application it is only described: nothing may read or write the entries of a device. Raises IcdError for
-    a layout that does not fit the rows.
+    a definition without `[canopen]`, and for a layout that does not fit its rows.
     """
 
-    def __init__(
-        self, icd: InterfaceDefinition, layout: CanopenModel, application: Application | None = None
-    ) -> None:
+    def __init__(self, icd: InterfaceDefinition, application: Application | None = None) -> None:
+        if icd.canopen is None:
+            raise IcdError(f"unit {icd.name}: has no CANopen node: its definition lacks the table [canopen]")
         self.icd = icd
-        self.layout = layout
+        self.layout = layout = icd.canopen
         self.application = cast("Application", application)
         self.sources: dict[str, set[Key]] = {}
         """Telemetry row → keys of the entries that contain it."""
@@ -105,11 +108,23 @@ class DeviceDictionary(Dictionary):
         for entry, names in found:
             self._names |= {f"{index:04x}.{name.lower()}": entry for name in names}
         entries = [entry for entry, _ in found]
-        if entries[0].key == (index, 0):
+        if [entry.key for entry in entries] == [(index, 0)]:
             self._names[f"{index:04x}"] = entries[0]
             objects.add_object(entries[0].variable)
-        else:
-            add_record(objects, placed.name, [entry.variable for entry in entries])
+            return entries
+        taken: dict[int, str] = {}
+        for entry in entries:
+            name, subindex = entry.variable.name, entry.key[1]
+            if not 1 <= subindex <= LARGEST_SUBINDEX:
+                raise IcdError(
+                    f"canopen.toml: {index:04X}h: {name} would be sub-index {subindex}, not 1 to 254"
+                )
+            if subindex in taken:
+                raise IcdError(
+                    f"canopen.toml: {index:04X}h: {taken[subindex]} and {name} are both sub-index {subindex}"
+                )
+            taken[subindex] = name
+        add_record(objects, placed.name, [entry.variable for entry in entries])
         return entries
 
     def _mapped(self, model: PdoModel) -> MappedPdo:
@@ -361,16 +376,6 @@ class DeviceDictionary(Dictionary):
             raw &= (1 << bits) - 1
         low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if packed.type[0] == "i" else (0, (1 << bits) - 1)
         return min(max(raw, low), high)
-
-
-def build_dictionary(icd: InterfaceDefinition, application: Application | None = None) -> DeviceDictionary:
-    """Build the object dictionary of the device that serves a definition, with the definition's layout.
-
-    Raises IcdError for a definition without `[canopen]`, and for a layout that does not fit its rows.
-    """
-    if icd.canopen is None:
-        raise IcdError(f"unit {icd.name}: has no CANopen node: its definition lacks the table [canopen]")
-    return DeviceDictionary(icd, icd.canopen, application)
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:

@@ -20,9 +20,6 @@ Value = int | float | bool | str | bytes
 MAXIMUM_STRING: Final = 256
 """Longest string or octet string that may be written, in bytes, unless the entry has its own limit."""
 
-COMMUNICATION: Final = range(0x1000, 0x2000)
-"""Indices of the communication profile; higher indices belong to the application."""
-
 
 class Deferred:
     """A write that the device has accepted and whose result follows by `finish_write`."""
@@ -46,8 +43,6 @@ class Entry:
     """Called before `value` changes."""
     maximum_size: int = MAXIMUM_STRING
     """Longest value, bytes, of a type without a fixed size."""
-    persistent: bool = False
-    """Whether store (1010h) saves it."""
 
     @property
     def key(self) -> tuple[int, int]:
@@ -101,9 +96,7 @@ class Dictionary:
         for item in od.values():
             members = [item] if isinstance(item, ODVariable) else item.subindices.values()
             for variable in members:
-                key = variable.index, variable.subindex
-                entry = self.entries.setdefault(key, Entry(variable))
-                entry.persistent = variable.writable and variable.readable
+                self.entries.setdefault((variable.index, variable.subindex), Entry(variable))
         self.changed: set[tuple[int, int]] = set()
         """Keys written since the node last cleared them."""
         self.instant = 0
@@ -121,13 +114,10 @@ class Dictionary:
             raise SdoAbortError(AbortCode.NO_SUBINDEX, f"{index:04X}h:{subindex:02X}h")
         raise SdoAbortError(AbortCode.NO_OBJECT, f"{index:04X}h")
 
-    def load_defaults(self, indices: range, node_id: int) -> None:
-        """Set the entries of a range of indices to their defaults.
-
-        Relative defaults include the node ID.
-        """
-        for (index, _), entry in self.entries.items():
-            if index in indices and entry.reader is None:
+    def load_defaults(self, node_id: int) -> None:
+        """Set the entries that keep a value to their defaults; relative defaults include the node ID."""
+        for entry in self:
+            if entry.reader is None:
                 entry.value = default_bytes(entry.variable, node_id)
 
     def new_instant(self) -> None:

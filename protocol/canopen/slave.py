@@ -21,7 +21,7 @@ from starhil.protocol.canopen.error_control import ErrorControl
 from starhil.protocol.canopen.lss import BIT_RATES, LssSlave
 from starhil.protocol.canopen.pdo import PdoService
 from starhil.protocol.canopen.sdo import SdoServer
-from starhil.protocol.canopen.storage import APPLICATION, COMMUNICATION, ParameterStorage
+from starhil.protocol.canopen.storage import ParameterStorage
 from starhil.protocol.canopen.store import ApplicationStore, ParameterStore
 from starhil.protocol.canopen.sync import SyncService
 from starhil.protocol.canopen.timestamp import TimeConsumer
@@ -194,7 +194,6 @@ class CanopenSlave:
         clock = self.dictionary.find(*HIGH_RESOLUTION)
         clock.reader = lambda: (self._clock_us() + self._clock_offset_us & 0xFFFFFFFF).to_bytes(4, "little")
         clock.writer = self._set_clock
-        clock.persistent = False
         stored_eds = self.dictionary.find(*STORED_EDS)
         stored_eds.reader = lambda: build_eds(self.dictionary).encode("ascii", errors="replace")
 
@@ -293,9 +292,7 @@ class CanopenSlave:
         self.lss.configuring = False
         self.sdo.reset()
         self.emergency.reset(application=application)
-        if application:
-            self.store.load(APPLICATION)
-        self.store.load(COMMUNICATION)
+        self.store.load()
         self._configure()
         if context.node_id == UNCONFIGURED:
             return
@@ -312,7 +309,7 @@ class CanopenSlave:
             self.pdos.configure()
         except SdoAbortError as refusal:
             self._context.report(EventKind.STORAGE_ERROR, detail=f"stored PDO mapping: {refusal}")
-            self.store.set_defaults(COMMUNICATION)
+            self.dictionary.load_defaults(self.node_id)
             self.pdos.configure()
         self.sync.configure()
         self.error_control.configure()

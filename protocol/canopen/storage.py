@@ -13,7 +13,6 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.user_file import read_user_file
 
 COMMUNICATION: Final = "communication"
-APPLICATION: Final = "application"
 LSS: Final = "lss"
 
 

@@ -8,14 +8,13 @@ from typing import Final, TypeAlias
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.context import Context, EventKind
-from starhil.protocol.canopen.dictionary import COMMUNICATION as COMMUNICATION_INDICES
 from starhil.protocol.canopen.dictionary import Deferred, Entry, default_bytes
-from starhil.protocol.canopen.storage import APPLICATION, COMMUNICATION, LSS, ParameterStorage, StorageError
+from starhil.protocol.canopen.storage import COMMUNICATION, LSS, ParameterStorage, StorageError
 
 STORE: Final = 0x1010
 RESTORE: Final = 0x1011
-ALL: Final = 1
-GROUPS: Final = {2: COMMUNICATION, 3: APPLICATION}
+ALL, COMMUNICATION_ONLY, APPLICATION_ONLY = 1, 2, 3
+"""Sub-indices of both objects."""
 SAVE: Final = b"save"
 LOAD: Final = b"load"
 ON_COMMAND: Final = b"\x01\0\0\0"
@@ -27,10 +26,10 @@ ApplicationStore: TypeAlias = Callable[[], Deferred | None]
 
 
 class ParameterStore:
-    """Saves parameters across a restart, and restores the defaults.
+    """Saves the parameters of the communication profile across a restart, and restores the defaults.
 
-    `on_save` saves the parameters of the application and raises `SdoAbortError` on failure; `on_restore` resets them to
-    their defaults at its next restart.
+    Those of the application are its own: `on_save` saves them and raises `SdoAbortError` on failure; `on_restore` resets
+    them to their defaults at its next restart.
     """
 
     def __init__(
@@ -45,25 +44,20 @@ class ParameterStore:
         self._on_save = on_save
         self._on_restore = on_restore
         for index, action in ((STORE, self._store), (RESTORE, self._restore)):
-            for subindex in (ALL, *GROUPS):
+            for subindex in (ALL, COMMUNICATION_ONLY, APPLICATION_ONLY):
                 entry = context.dictionary.find(index, subindex)
                 entry.reader = lambda: ON_COMMAND
                 entry.writer = partial(action, subindex)
-                entry.persistent = False
 
-    def load(self, group: str) -> None:
-        """Set the group's entries to their defaults, then to their stored values."""
-        self.set_defaults(group)
-        for name, value in self._stored(group).items():
-            entry = self._named(name)
-            if entry is not None and self._belongs(entry, group) and entry.size in {None, len(value)}:
+    def load(self) -> None:
+        """Set the entries to their defaults, then to their stored values."""
+        dictionary = self._context.dictionary
+        dictionary.load_defaults(self._context.node_id)
+        for name, value in self._stored(COMMUNICATION).items():
+            index, _, subindex = name.partition(":")
+            entry = dictionary.entries.get((int(index, 16), int(subindex, 16)))
+            if entry is not None and _is_stored(entry) and entry.size in {None, len(value)}:
                 entry.value = value
-
-    def set_defaults(self, group: str) -> None:
-        """Set the group's entries to their defaults; leave the stored values unchanged."""
-        above = range(COMMUNICATION_INDICES.stop, 0x10000)
-        indices = COMMUNICATION_INDICES if group == COMMUNICATION else above
-        self._context.dictionary.load_defaults(indices, self._context.node_id)
 
     def load_lss(self) -> tuple[int, int] | None:
         """Return the node ID and the bit rate, bit/s, that LSS stored, or None."""
@@ -87,51 +81,44 @@ class ParameterStore:
             self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
             return {}
 
-    def _named(self, name: str) -> Entry | None:
-        index, _, subindex = name.partition(":")
-        return self._context.dictionary.entries.get((int(index, 16), int(subindex, 16)))
-
-    def _belongs(self, entry: Entry, group: str) -> bool:
-        if not entry.persistent or entry.reader is not None:
-            return False
-        return (entry.key[0] in COMMUNICATION_INDICES) == (group == COMMUNICATION)
-
     def _store(self, subindex: int, data: bytes) -> Deferred | None:
         if data != SAVE:
             raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'save'")
-        deferred = self._for_groups(subindex, self._save, self._on_save)
+        deferred = self._apply(subindex, self._save, self._on_save)
         self._context.report(EventKind.STORED, subindex)
         return deferred
 
     def _restore(self, subindex: int, data: bytes) -> Deferred | None:
         if data != LOAD:
             raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'load'")
-        deferred = self._for_groups(subindex, self._storage.clear, self._on_restore)
+        deferred = self._apply(subindex, partial(self._storage.clear, COMMUNICATION), self._on_restore)
         self._context.report(EventKind.RESTORED, subindex)
         return deferred
 
-    def _for_groups(
-        self, subindex: int, action: Callable[[str], None], application: ApplicationStore | None
+    def _apply(
+        self, subindex: int, action: Callable[[], None], application: ApplicationStore | None
     ) -> Deferred | None:
-        """Save or clear the groups of a sub-index, then those of the application."""
-        deferred = None
-        for number, group in GROUPS.items():
-            if subindex in {ALL, number}:
-                try:
-                    action(group)
-                except StorageError as error:
-                    self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
-                    raise SdoAbortError(AbortCode.HARDWARE, str(error)) from None
-                if group == APPLICATION and application is not None:
-                    deferred = application()
-        return deferred
+        """Save or clear the parameters of a sub-index, those of the application last."""
+        if subindex in {ALL, COMMUNICATION_ONLY}:
+            try:
+                action()
+            except StorageError as error:
+                self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
+                raise SdoAbortError(AbortCode.HARDWARE, str(error)) from None
+        if subindex in {ALL, APPLICATION_ONLY} and application is not None:
+            return application()
+        return None
 
-    def _save(self, group: str) -> None:
-        """Save the values of a group that differ from their defaults, which may depend on the node ID."""
+    def _save(self) -> None:
+        """Save the values that differ from their defaults, which may depend on the node ID."""
         values = {
             f"{entry.key[0]:04X}:{entry.key[1]:02X}": entry.value
             for entry in self._context.dictionary
-            if self._belongs(entry, group)
-            and entry.value != default_bytes(entry.variable, self._context.node_id)
+            if _is_stored(entry) and entry.value != default_bytes(entry.variable, self._context.node_id)
         }
-        self._storage.save(group, values)
+        self._storage.save(COMMUNICATION, values)
+
+
+def _is_stored(entry: Entry) -> bool:
+    """Return whether an entry keeps a value that can be changed and read; those that read the device do not."""
+    return entry.reader is None and entry.variable.writable and entry.variable.readable

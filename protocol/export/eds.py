@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.definition import InterfaceDefinition
 
 
 def render(icd: InterfaceDefinition) -> str:
     """Return the EDS of the node that serves this definition."""
-    return build_eds(build_dictionary(icd))
+    return build_eds(DeviceDictionary(icd))

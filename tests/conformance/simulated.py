@@ -33,7 +33,7 @@ from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import settings_of
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import DEFAULT_UNIT
@@ -198,7 +198,7 @@ class SimulatedUnit:
         self.probe: SerialProbe | CanProbe | CanopenProbe
         if self.kind == "canopen":
             node = int(self.icd.parameters["canopen_node"].default)
-            eds = build_eds(build_dictionary(self.icd))
+            eds = build_eds(DeviceDictionary(self.icd))
             self.probe = CanopenProbe(port, node, import_eds(eds, node), eds)
             self.loop.run_until_complete(asyncio.sleep(1.0))
             return self

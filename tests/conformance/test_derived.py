@@ -404,3 +404,16 @@ def test_parameters_are_read_back_and_restored(place, tmp_path):
         ).status
         == "failed"
     )
+
+
+def test_parameters_that_a_row_reports_are_restored_after_the_run(tmp_path):
+    def leave_changed(probe):
+        seen = probe.telemetry("imaging_state")
+        probe.command("imaging", **{**seen, "follows": not seen["follows"]})
+
+    with SimulatedUnit("serial", unit=with_parameters(tmp_path)) as simulated:
+        before = simulated.probe.telemetry("imaging_state")
+        case = Case("serial.own.change", "serial.own", "t", "c", leave_changed, intrusive=True)
+        outcomes = run_cases(simulated.probe, [case])
+        assert [outcome.status for outcome in outcomes] == ["passed"]
+        assert simulated.probe.telemetry("imaging_state") == before

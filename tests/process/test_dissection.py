@@ -8,7 +8,7 @@ import canopen
 import pytest
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.icd import load_unit
 from tests.candump import read_candump
@@ -48,7 +48,7 @@ def talk_canopen(hub: str, folder) -> None:
     """Drive the node as a master does: heartbeat, PDOs by event and by SYNC, a block upload, an abort."""
     host, _, port = hub.removeprefix("socketcand:").partition("/")[0].rpartition(":")
     eds = folder / "unit.eds"
-    eds.write_text(build_eds(build_dictionary(load_unit())), encoding="ascii")
+    eds.write_text(build_eds(DeviceDictionary(load_unit())), encoding="ascii")
     network = canopen.Network()
     network.connect(interface="socketcand", host=host, port=int(port), channel="vcan0")
     try:

@@ -44,7 +44,7 @@ def _parameter_cases(item: Parameter) -> Iterator[Case[LinkProbe]]:
         for key, wanted in (("minimum", item.minimum), ("maximum", item.maximum)):
             check_equal(seen[key], float(wanted), key)
         value = float(seen["value"])
-        check(_within(value, item), f"a value within {item.minimum:g} to {item.maximum:g}", value)
+        check(item.value_of(value) is not None, f"a value within {item.minimum:g} to {item.maximum:g}", value)
 
     def refusals(probe: LinkProbe) -> None:
         before = value_of(probe, item.name)
@@ -76,11 +76,6 @@ def _parameter_cases(item: Parameter) -> Iterator[Case[LinkProbe]]:
         ("values", f"{name} accepts its smallest and largest value", values),
     ):
         yield Case(f"parameters.{name}.{check_name}", "parameters", title, clause, run, intrusive=True)
-
-
-def _within(value: float, parameter: Parameter) -> bool:
-    slack = F32_ROUNDING * max(abs(parameter.minimum), abs(parameter.maximum))
-    return parameter.minimum - slack <= value <= parameter.maximum + slack
 
 
 def _whole(parameter: Parameter) -> bool:

@@ -1,9 +1,11 @@
 """Random lives of units: none ends in a violation, the same seed gives the same life, and what fails is written."""
 
 import asyncio
+import tomllib
 from dataclasses import asdict, replace
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
@@ -27,6 +29,8 @@ from starhil.protocol.icd import load_unit
 from starhil.protocol.names import bundled_units
 
 LIVES, STEPS = 4, 150
+ROOT = Path(__file__).parents[3]
+MUTANTS = tomllib.loads((ROOT / "tests/hil_tests/endurance/mutants.toml").read_text())["mutant"]
 READ_MODE = {"do": "request", "link": "serial", "row": ["", 160, "telemetry"]}
 
 
@@ -397,3 +401,10 @@ def test_a_life_of_a_unit_without_telecommands_reads_it(tmp_path):
     outcome = run_once(life)
     assert outcome.violation == ""
     assert outcome.readings > 20
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant["name"])
+def test_the_text_of_a_planted_defect_occurs_once(mutant):
+    text = (ROOT / mutant["file"]).read_text()
+    assert text.count(mutant["before"]) == 1
+    assert mutant["before"] != mutant["after"]

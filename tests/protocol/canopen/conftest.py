@@ -20,7 +20,7 @@ from starhil.hil_tests.conformance.case import CaseFailed
 from starhil.hil_tests.conformance.runner import run_case
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.application import GreyImage
-from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import ParameterStorage
 from starhil.protocol.icd import load_unit
@@ -35,7 +35,7 @@ class Bench:
     def __init__(
         self, node_id: int = NODE, storage: ParameterStorage | None = None, unit: str = "cubestar", **options
     ) -> None:
-        self.dictionary: DeviceDictionary = build_dictionary(load_unit(unit))
+        self.dictionary: DeviceDictionary = DeviceDictionary(load_unit(unit))
         self.application = StandInApplication(self.dictionary.icd)
         self.dictionary.application = self.application
         self.storage = storage
@@ -194,7 +194,7 @@ def import_eds(text: str, node_id: int) -> canopen.ObjectDictionary:
 
 def simulated_probe(package=starhil.protocol.canopen) -> CanopenProbe:
     """Put the slave of a package (the original, or a mutant) on a simulated bus, with the tester at its other end."""
-    dictionary = package.device_dictionary.build_dictionary(load_unit())
+    dictionary = package.device_dictionary.DeviceDictionary(load_unit())
 
     class RestlessApplication(StandInApplication):
         """Each look at the attitude finds a new one, so that values of two samples cannot be taken for one."""

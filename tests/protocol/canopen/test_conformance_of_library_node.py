@@ -8,7 +8,7 @@ import canopen
 import pytest
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.icd import load_unit
 
@@ -80,7 +80,7 @@ LIBRARY_FAULTS = {
 
 @pytest.fixture(scope="module")
 def library_outcomes(run_conformance, read_eds):
-    eds = build_eds(build_dictionary(load_unit()))
+    eds = build_eds(DeviceDictionary(load_unit()))
     return run_conformance(LibraryNodeBus(read_eds(eds)), eds)
 
 

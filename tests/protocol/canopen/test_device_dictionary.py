@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import pytest
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import check_status
-from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import find_unit
+from starhil.protocol.unit_examples import examine
 from starhil.protocol.values import IcdError
 
 ICD = load_unit()
 
 
 def test_the_subindex_of_every_row_is_its_id():
-    entries = build_dictionary(load_unit()).entries
+    entries = DeviceDictionary(load_unit()).entries
     assert {subindex for index, subindex in entries if index == 0x2000} == {0, *(row.id for row in ICD.rows)}
 
 
@@ -143,13 +148,45 @@ def layout(**changes) -> CanopenModel:
             },
             "differ in type",
         ),
+        (
+            {
+                "object": [
+                    {
+                        "index": 0x6000,
+                        "name": "x",
+                        "members": [{"name": n, "subindex": 1, "value": "unix_time.seconds"} for n in "ab"],
+                    }
+                ],
+                "tpdo": [],
+                "rpdo": [],
+            },
+            "6000h: a and b are both sub-index 1",
+        ),
     ],
 )
 def test_layouts_that_do_not_fit_the_definition(changes, text):
     from starhil.protocol.errors import ProtocolError
 
     with pytest.raises(ProtocolError, match=text):
-        DeviceDictionary(ICD, layout(**changes))
+        DeviceDictionary(replace(ICD, canopen=layout(**changes)))
+
+
+@pytest.mark.parametrize("unit", ["cubestar", "oresat"])
+def test_what_can_be_read_of_the_device_is_kept_by_the_device_alone(unit):
+    """So the node has only communication parameters to store."""
+    application = [entry for entry in DeviceDictionary(load_unit(unit)) if entry.key[0] >= 0x2000]
+    kept = {entry.key[1] for entry in application if entry.reader is None and entry.variable.readable}
+    assert len(application) > 50
+    assert kept == {0}
+
+
+def test_rows_that_are_no_sub_indices():
+    request = {"object": [{"index": 0x6000, "name": "x", "requests": True}], "tpdo": [], "rpdo": []}
+    for number in (0, 255):
+        row = ICD.telecommands["reset"].model_copy(update={"id": number})
+        icd = replace(ICD, canopen=layout(**request), telecommands={"reset": row})
+        with pytest.raises(IcdError, match=f"6000h: reset would be sub-index {number}, not 1 to 254"):
+            DeviceDictionary(icd)
 
 
 UNIT_HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "x"\n'
@@ -167,7 +204,17 @@ def test_layouts_that_cannot_be_read(tmp_path, text, reason):
     path = tmp_path / "unit.toml"
     path.write_text(UNIT_HEAD + text, encoding="ascii")
     with pytest.raises(IcdError, match=reason):
-        build_dictionary(load_unit(path))
+        DeviceDictionary(load_unit(path))
+
+
+def test_a_check_of_a_unit_finds_what_its_eds_cannot_hold(tmp_path):
+    text = (find_unit("oresat") / "oresat.toml").read_text(encoding="utf-8")
+    path = tmp_path / "oresat.toml"
+    path.write_text(text.replace('name = "make_status_file"', 'name = "update"'), encoding="utf-8")
+    _, (error,), _ = examine(path)
+    assert re.search(
+        r"object (....h), sub-index \d+: has the same name as object \1, sub-index \d+ in EDS: update", error
+    )
 
 
 def test_object_of_two_kinds():

@@ -14,7 +14,7 @@ import dcf
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.icd import load_unit
 
@@ -22,7 +22,7 @@ from starhil.protocol.icd import load_unit
 @pytest.fixture(scope="module")
 def eds(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("eds") / "star-sensor.eds"
-    path.write_text(build_eds(build_dictionary(load_unit())), encoding="ascii")
+    path.write_text(build_eds(DeviceDictionary(load_unit())), encoding="ascii")
     return path
 
 
@@ -62,12 +62,12 @@ def test_lely_sees_the_default_mappings(eds):
 
 
 def test_same_dictionary_gives_the_same_text(eds):
-    assert build_eds(build_dictionary(load_unit())) == eds.read_text(encoding="ascii")
+    assert build_eds(DeviceDictionary(load_unit())) == eds.read_text(encoding="ascii")
 
 
 def test_data_sheet_and_dictionary_have_the_same_objects(od):
     listed = {(item.index, item.subindex) for item in variables(od) if item.index >= 0x1000}
-    assert listed == set(build_dictionary(load_unit()).entries)
+    assert listed == set(DeviceDictionary(load_unit()).entries)
 
 
 def test_the_eds_describes_the_served_dictionary(bench, od):
@@ -113,7 +113,7 @@ def test_lists_cover_every_object_once(eds):
     for section in ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects"):
         count = parser.getint(section, "SupportedObjects")
         listed += [int(parser.get(section, str(number)), 0) for number in range(1, count + 1)]
-    assert sorted(listed) == sorted({index for index, _ in build_dictionary(load_unit()).entries})
+    assert sorted(listed) == sorted({index for index, _ in DeviceDictionary(load_unit()).entries})
 
 
 def test_data_sheet_is_served_by_the_node(bench, eds):

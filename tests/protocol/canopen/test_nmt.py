@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from starhil.protocol.canopen.context import NmtState
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
@@ -74,7 +74,7 @@ def test_reset_communication_restores_communication_only(bench):
 @pytest.mark.parametrize("node_id", [0, 128, 254, -1, 300])
 def test_invalid_node_id_is_rejected(node_id):
     with pytest.raises(ProtocolError, match="node ID"):
-        CanopenSlave(build_dictionary(load_unit()), node_id)
+        CanopenSlave(DeviceDictionary(load_unit()), node_id)
 
 
 # Heartbeat producer

@@ -6,7 +6,7 @@ import pytest
 
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import download, requests_of, row_transfer
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.icd import load_unit
@@ -30,7 +30,7 @@ class Node:
 
     def __init__(self, unit):
         self.icd = load_unit(unit)
-        self.dictionary = build_dictionary(self.icd)
+        self.dictionary = DeviceDictionary(self.icd)
         self.dictionary.application = self.application = NumberedRows(self.icd)
         self.slave = CanopenSlave(self.dictionary, NODE)
         self.slave.start(0.0)
@@ -80,4 +80,4 @@ def test_a_row_outside_the_dictionary_is_named():
     icd = load_unit("oresat")
     row = load_unit("cubestar").telemetry["health"]
     with pytest.raises(IcdError, match="unit oresat: no entry of its object dictionary holds health"):
-        row_transfer(build_dictionary(icd), row)
+        row_transfer(DeviceDictionary(icd), row)

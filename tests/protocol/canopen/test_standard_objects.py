@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import canopen
 import pytest
 
 from starhil.protocol.canopen.abort import AbortCode
-from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.icd import load_unit
@@ -69,10 +71,10 @@ def test_a_record_that_sets_a_telecommand_must_report_it():
     layout = icd.canopen.model_dump(by_alias=True) | {"object": [record], "tpdo": [], "rpdo": []}
     assert icd.telemetry["card_progress"].size == icd.telecommands["select_parameter"].size
     with pytest.raises(IcdError, match="card_progress must include select_parameter alone"):
-        DeviceDictionary(icd, CanopenModel.model_validate(layout))
+        DeviceDictionary(replace(icd, canopen=CanopenModel.model_validate(layout)))
 
 
 def test_a_scaled_entry_is_described_in_the_eds():
-    eds = build_eds(build_dictionary(load_unit("cubestar")))
+    eds = build_eds(DeviceDictionary(load_unit("cubestar")))
     assert "[raw * 0.001 deg/s]" in eds
     assert "raw * 1 " not in eds
