@@ -38,7 +38,7 @@ class CanopenHostLink(HostLink[CanFrame]):
 
         Raises BenchError: the object dictionary does not hold the row.
         """
-        row = self._icd.rows_by_key.get((request.klass, request.id))
+        row = self._icd.row(request.id, request.klass)
         if row is None:
             raise BenchError(f"{self.description}: request {request.id} is not in the object dictionary")
         try:

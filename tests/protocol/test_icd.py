@@ -30,13 +30,13 @@ PUBLISHED_SIZES = {
 
 @pytest.mark.parametrize(("identifier", "size"), PUBLISHED_SIZES.items())
 def test_published_rows_have_their_published_sizes(identifier: int, size: int) -> None:
-    row = ICD.row_by_id(identifier)
+    row = ICD.row(identifier)
     assert row is not None
     assert row.size == size
 
 
 def test_the_escape_byte_is_not_an_id() -> None:
-    assert ICD.row_by_id(0x1F) is None
+    assert ICD.row(0x1F) is None
 
 
 def test_own_rows_are_marked_and_published_rows_name_their_source() -> None:

@@ -104,7 +104,7 @@ def test_rows_of_two_classes_may_have_one_id(unit):
     icd = unit(
         HEAD + CLASSES + telemetry(a, "one", 5, 'class = "get"') + telemetry(b, "two", 5, 'class = "watch"')
     )
-    assert icd.rows_by_key["get", 5].name == "one"
+    assert icd.row(5, "get").name == "one"
     assert icd.telemetry_row(5).name == "one"
     assert icd.telemetry_row(5, "watch").name == "two"
     assert icd.request(icd.telemetry["two"]).klass == "watch"
