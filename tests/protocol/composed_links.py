@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -74,7 +75,7 @@ def definition(
     )  # fmt: skip
 
 
-CUBESPACE = stack_of({"framing": {"kind": "cubespace"}})
+CUBESPACE = SerialStack(replace(definition({"framing": {"kind": "cubespace"}}), first_telemetry_id=128))
 CUBESTAR = SerialStack(load_unit("cubestar"))
 
 SAGITTA = stack_of(
