@@ -11,9 +11,9 @@ from starhil.protocol.canopen.cob import SDO_RECEIVE, SDO_TRANSMIT
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import SdoTransfer, row_transfer
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.errors import IcdError
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.transports import open_can
-from starhil.protocol.values import IcdError
 
 
 class CanopenHostLink(HostLink[CanFrame]):

@@ -22,7 +22,7 @@ from starhil.protocol.codec import Row
 from starhil.protocol.cubespace import Dialect, DialectReplies
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.envelope import Envelope, Header, HeaderError
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.framings import Deframer, Receiving, build_framing
 from starhil.protocol.link_schema import (
     CubeSpaceFraming,
@@ -43,7 +43,6 @@ from starhil.protocol.messages import (
     RequestKind,
     error_code,
 )
-from starhil.protocol.values import IcdError
 
 LINK_FORMAT: Final = FormatModel()
 """The framing and check of the link itself."""

@@ -10,9 +10,9 @@ from typing import Final
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.errors import IcdError
 from starhil.protocol.link_schema import CustomCheck, CustomFraming, FixedFraming, LengthFraming, MessageClass
 from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.values import IcdError
 
 CLASS_SHIFT: Final = 8
 """Position of the class code, in bits."""

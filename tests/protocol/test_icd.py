@@ -12,10 +12,17 @@ from hypothesis import strategies as st
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import UnknownNameError
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.names import find_unit
-from starhil.protocol.values import FieldError, IcdError, LengthError, MessageError, Value, to_f32
+from starhil.protocol.values import (
+    FieldError,
+    LengthError,
+    MessageError,
+    Value,
+    to_f32,
+)
 
 ICD = load_unit()
 ROWS = list(ICD.rows)
@@ -246,6 +253,7 @@ REFUSED: list[tuple[str, dict[str, Value], str]] = [
     ("set_unix_time", {"seconds": 1.5}, "not a whole number"),
     ("set_unix_time", {}, "set_unix_time.seconds: missing value"),
     ("set_mode", {"mode": "error"}, "not one of standby"),
+    ("set_mode", {"mode": "stanby"}, r"'stanby' is not one of standby \(1\).*; did you mean standby\?$"),
     ("set_mode", {"mode": 9}, "not one of standby"),
     ("set_mode", {"mood": "standby"}, "set_mode.mood: no such field"),
     ("set_update_rate", {"rate": 0.0}, "rate: 0.0 is outside 0.01 to 100 Hz"),

@@ -5,12 +5,13 @@ from pathlib import Path
 import pytest
 
 from starhil.protocol.device_model import device_model
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import SKELETON, bundled_units
 from starhil.protocol.plugin import quantity
 from starhil.protocol.unit_examples import examine, exchanges
 from starhil.protocol.units_of_measure import factor
-from starhil.protocol.values import FieldError, IcdError
+from starhil.protocol.values import FieldError
 
 HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "d"\n'
 BIG = HEAD + '[conventions]\nbyte_order = "big"\n'

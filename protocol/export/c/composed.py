@@ -8,6 +8,7 @@ from typing import Any, Final
 from starhil.protocol.checks import reversed_bits
 from starhil.protocol.conventions import Order
 from starhil.protocol.envelope import Header
+from starhil.protocol.errors import IcdError
 from starhil.protocol.export.packets import check_one_format, row_key
 from starhil.protocol.export.templates import fill, part_of, text_of
 from starhil.protocol.link_schema import (
@@ -22,7 +23,6 @@ from starhil.protocol.link_schema import (
     XxHashCheck,
 )
 from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.values import IcdError
 
 _MARKS: Final = 8
 """Maximum size of the start and end marks of a message, in bytes, apart from those in a definition."""
