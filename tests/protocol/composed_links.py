@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -72,10 +71,11 @@ def definition(
         Names("enum", ()), Names("parameter", ()), Names("parameter", ()),
         link=LinkModel(serial=SerialLinkModel.model_validate(link)), conventions=Conventions(byte_order=order),
         classes=classes, plugin=plugin or Plugin(),
+        first_telemetry_id=128 if link["framing"]["kind"] == "cubespace" else None,
     )  # fmt: skip
 
 
-CUBESPACE = SerialStack(replace(definition({"framing": {"kind": "cubespace"}}), first_telemetry_id=128))
+CUBESPACE = stack_of({"framing": {"kind": "cubespace"}})
 CUBESTAR = SerialStack(load_unit("cubestar"))
 
 SAGITTA = stack_of(
