@@ -32,7 +32,8 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections import ChainMap
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -81,19 +82,8 @@ class CaseFile(_Model):
     texts: dict[str, str] = {}
     area: list[AreaText]
 
-    def cases(self, link: str, names: Mapping[str, str]) -> Iterator[Case[LinkProbe]]:
-        """Yield the cases for a link; `names` are its names in braces."""
-        known = {**names, **self.texts}
-        for area in self.area:
-            for item in area.cases if link in area.links else ():
-                with suppress(KeyError):
-                    texts = item.id, item.title, item.clause or area.clause, item.lines
-                    name, title, clause, lines = (text.format(**known) for text in texts)
-                    changes = area.intrusive if item.intrusive is None else item.intrusive
-                    yield case_in(area.name, name, title, partial(hold, lines), clause, intrusive=changes)
 
-
-def read_case_file(path: Path) -> CaseFile:
+def _read(path: Path) -> CaseFile:
     """Read a file of cases.
 
     Raises BenchError: it is not one; the text names all errors.
@@ -136,3 +126,30 @@ def _value(text: str) -> Any:
     with suppress(ValueError):
         return json.loads(text)
     return text
+
+
+def text_cases(
+    path: Path,
+    link: str,
+    names: dict[str, str],
+    run: Callable[[str, Any], None] = hold,
+    faults: Callable[[str], Iterable[str]] = lambda _lines: (),
+) -> list[Case[Any]]:
+    """Return the cases of a file for a link; `names` are its names in braces, `run` carries out lines with a probe.
+
+    Raises BenchError: the file cannot be read, has errors, or `faults` finds some in lines; one line for each.
+    """
+    file = _read(path)
+    known = ChainMap(file.texts, names)
+    found, wrong = [], []
+    for area in file.area:
+        for item in area.cases if link in area.links else ():
+            with suppress(KeyError):
+                texts = item.id, item.title, item.clause or area.clause, item.lines
+                name, title, clause, lines = (text.format_map(known) for text in texts)
+                changes = area.intrusive if item.intrusive is None else item.intrusive
+                found.append(case_in(area.name, name, title, partial(run, lines), clause, intrusive=changes))
+                wrong += [f"{path}: {area.name}.{name}: {fault}" for fault in faults(lines)]
+    if wrong:
+        raise BenchError(*wrong)
+    return found
