@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.case import Case, case_in, rule
-from starhil.hil_tests.conformance.case_file import CUBESPACE_CASES, read_case_file
+from starhil.hil_tests.conformance.case_file import CUBESPACE_CASES, text_cases
 from starhil.hil_tests.conformance.ports import CanFrame
 from starhil.hil_tests.conformance.row_cases import row_cases
 from starhil.hil_tests.judge.can import can_id_of, segments
@@ -23,7 +23,7 @@ LONGEST: Final = 56
 
 def can_cases(unit: Unit) -> Iterator[Case[Any]]:
     """Yield the cases for a unit with a CAN link."""
-    yield from read_case_file(CUBESPACE_CASES).cases("can", can_names(unit))
+    yield from text_cases(CUBESPACE_CASES, "can", can_names(unit))
     yield from row_cases(unit)
     yield case_in("recovery", "noise", "after noise the next valid request is answered", noise, rule(9))
 

@@ -84,16 +84,8 @@ from starhil.hil_tests.conformance.canopen_probe import (
     check_abort,
     check_answer,
 )
-from starhil.hil_tests.conformance.case import (
-    Case,
-    CaseFailed,
-    CaseSkipped,
-    case_in,
-    check,
-    check_equal,
-)
-from starhil.hil_tests.conformance.case_file import read_case_file
-from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, check, check_equal
+from starhil.hil_tests.conformance.case_file import text_cases
 from starhil.hil_tests.judge.canopen import ABORT, HEARTBEAT, SDO_RESPONSE, SEGMENT, SYNC
 from starhil.protocol.names import did_you_mean
 
@@ -201,7 +193,6 @@ def _lines(text: str) -> list[tuple[int, str]]:
 
 
 def _faults(line: str) -> Iterator[str]:
-    """Yield what is wrong with a line."""
     try:
         if line.startswith("if "):
             _, needed, line = line.split(maxsplit=2)
@@ -236,7 +227,7 @@ def _faults_of_request(words: Sequence[str], answer: str) -> Iterator[str]:
             yield f"unknown answer {wanted!r}"
 
 
-# --- files ---
+# --- holding a dialogue ---
 
 
 def dialogue_cases(path: Path) -> list[Case[CanopenProbe]]:
@@ -244,41 +235,22 @@ def dialogue_cases(path: Path) -> list[Case[CanopenProbe]]:
 
     Raises BenchError: the file cannot be read, or has errors; one line for each.
     """
-    file = read_case_file(path)
-    items = [(area, item) for area in file.area if "canopen" in area.links for item in area.cases]
-    texts = _Texts(file.texts)
-    found = [
-        f"{path}: {area.name}.{item.id}: line {number}: {fault}"
-        for area, item in items
-        for number, line in _lines(item.lines.format_map(texts))
-        for fault in _faults(line)
-    ]
-    if found:
-        raise BenchError(*found)
-    return [
-        case_in(
-            f"canopen.{area.name}",
-            item.id,
-            item.title,
-            partial(_hold, [line for _, line in _lines(item.lines.format_map(texts))]),
-            item.clause or area.clause,
-            intrusive=area.intrusive if item.intrusive is None else item.intrusive,
-        )
-        for area, item in items
-    ]
+    return text_cases(path, "canopen", _Later(), _hold, _faults_of_dialogue)
 
 
-class _Texts(dict[str, str]):
-    """Texts of a file for names in braces; other names remain."""
+class _Later(dict[str, str]):
+    """Names in braces, which remain until the dialogue is held."""
 
     def __missing__(self, name: str) -> str:
         return f"{{{name}}}"
 
 
-# --- holding a dialogue ---
+def _faults_of_dialogue(text: str) -> list[str]:
+    return [f"line {number}: {fault}" for number, line in _lines(text) for fault in _faults(line)]
 
 
-def _hold(lines: list[str], probe: CanopenProbe) -> None:
+def _hold(text: str, probe: CanopenProbe) -> None:
+    lines = [line for _, line in _lines(text)]
     for line in lines:
         if line.startswith("need "):
             probe.require(*line.split()[1:])

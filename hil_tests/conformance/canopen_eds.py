@@ -12,7 +12,7 @@ from starhil.hil_tests.conformance.canopen_probe import CanopenProbe, is_integer
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 from starhil.hil_tests.judge.canopen import multiplexer
 
-EDS: Final = CaseArea[CanopenProbe]("canopen.eds", "CiA 306 4.5")
+EDS: Final = CaseArea[CanopenProbe]("eds", "CiA 306 4.5")
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 ACCESS: Final = {"ro", "rw", "wo", "const", "rwr", "rww"}
 LISTS: Final = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")

@@ -10,7 +10,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, encoded, is_integer, size_of
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
-OD: Final = CaseArea[CanopenProbe]("canopen.od", "CiA 301 7.2.4.3.17", intrusive=True)
+OD: Final = CaseArea[CanopenProbe]("od", "CiA 301 7.2.4.3.17", intrusive=True)
 NOT_NOW = {Abort.NO_DATA, Abort.GENERAL, Abort.DEVICE_STATE, Abort.NOT_STORED}
 """Aborts which show that an object exists but has no value at present."""
 

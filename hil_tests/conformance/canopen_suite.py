@@ -9,11 +9,12 @@ from starhil.hil_tests.conformance import canopen_eds, canopen_od
 from starhil.hil_tests.conformance.canopen_dialogue import dialogue_cases
 from starhil.hil_tests.conformance.canopen_probe import NO_RTR, PDO_OFF, START, CanopenProbe
 from starhil.hil_tests.conformance.canopen_unit import canopen_unit_cases
-from starhil.hil_tests.conformance.case import Case, CaseArea, cases_of, check, check_equal
+from starhil.hil_tests.conformance.case import Case, CaseArea, cases_of, check, check_equal, on_link
+from starhil.hil_tests.conformance.suites import suite
 from starhil.hil_tests.judge.canopen import SYNC
 from starhil.hil_tests.judge.definition import Unit
 
-DESIGN: Final = CaseArea[CanopenProbe]("canopen.design", "interface definition: canopen.toml", intrusive=True)
+DESIGN: Final = CaseArea[CanopenProbe]("design", "interface definition: canopen.toml", intrusive=True)
 """Behaviour of this product beyond CiA 301."""
 
 
@@ -43,22 +44,18 @@ def _dialogues(name: str) -> list[Case[CanopenProbe]]:
     return dialogue_cases(Path(__file__).with_name(f"canopen_{name}_cases.toml"))
 
 
-CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
+_GENERAL: Final = (
     *cases_of(canopen_eds), *_dialogues("nmt"), *_dialogues("sdo"), *cases_of(canopen_od), *_dialogues("emcy"),
     *_dialogues("pdo"), *DESIGN.cases, *_dialogues("store"), *_dialogues("lss"),
 )  # fmt: skip
+CANOPEN_CASES: Final = on_link("canopen", _GENERAL)
 """Cases of CiA 301, for any unit."""
 
 
 def canopen_suite(unit: Unit) -> tuple[Case[Any], ...]:
-    """Return the cases for a unit on CANopen, with those of its own files, which replace any with the same ID.
+    """Return the cases for a unit on CANopen; raises BenchError if it has no node."""
+    return suite(unit, "CANopen", unit.canopen, _cases, dialogue_cases)
 
-    Raises IcdError: the unit has no CANopen node. Raises BenchError: a file has errors.
-    """
-    files = sorted(unit.folder.glob("*_cases.toml")) if unit.folder is not None else ()
-    found = (
-        *CANOPEN_CASES,
-        *canopen_unit_cases(unit),
-        *(case for path in files for case in dialogue_cases(path)),
-    )
-    return tuple({case.id: case for case in found}.values())
+
+def _cases(unit: Unit) -> list[Case[Any]]:
+    return [*_GENERAL, *canopen_unit_cases(unit)]

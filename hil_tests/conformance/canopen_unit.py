@@ -59,7 +59,7 @@ def canopen_unit_cases(unit: Unit) -> list[Case[CanopenProbe]]:
 def _case(
     area: str, name: str, title: str, run: Run, clause: str | Row = CLAUSE, *, safe: bool = False
 ) -> Case[CanopenProbe]:
-    return case_in(f"canopen.{area}", name, title, run, clause, intrusive=not safe)
+    return case_in(area, name, title, run, clause, intrusive=not safe)
 
 
 # --- reading and writing ---

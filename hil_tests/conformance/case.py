@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
@@ -93,6 +93,15 @@ def cases_of(*modules: ModuleType) -> list[Case[Any]]:
     """Return the cases of all areas defined in modules, in order."""
     areas = (item for module in modules for item in vars(module).values() if isinstance(item, CaseArea))
     return [case for area in areas for case in area.cases]
+
+
+def on_link(link: str, cases: Iterable[Case[Any]]) -> tuple[Case[Any], ...]:
+    """Return cases with IDs and areas that begin with the link; of those with the same ID the last, in place of the first."""
+    found = {item.id: item for item in cases}
+    return tuple(
+        replace(item, id=f"{link}.{item.id}", area=f"{link}.{item.id.split('.', 1)[0]}")
+        for item in found.values()
+    )
 
 
 def rule(number: int) -> str:

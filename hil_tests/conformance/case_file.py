@@ -32,7 +32,8 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections import ChainMap
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -40,15 +41,28 @@ from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from starhil.hil_tests.conformance.case import Case, case_in, check_equal
+from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal
 from starhil.hil_tests.conformance.link_probe import LinkProbe
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.errors import reason
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import problems
 
 CUBESPACE_CASES: Final = Path(__file__).with_name("cubespace_cases.toml")
 REPEATED: Final = re.compile(r"\(([^()]*)\)\*(\d+)")
+VERBS: Final = {
+    "silence": range(2),
+    "sleep": range(1, 2),
+    "drain": range(1),
+    "command": range(1, 2),
+    "telemetry": range(2, 99),
+}
+"""Steps other than raw traffic, and how many words may follow."""
+SECONDS: Final = re.compile(r"\d+(\.\d*)?")
+SENT: Final = re.compile(r"([0-9A-F]{2})+|[0-9A-FHD]+#([0-9A-F]*|R)", re.IGNORECASE)
+ANSWER: Final = re.compile(r"\d+(!\w*)?|[0-9A-FHD]+#[0-9A-F.]*", re.IGNORECASE)
+"""Bytes or a frame, and an answer."""
 
 
 class _Model(BaseModel):
@@ -81,35 +95,56 @@ class CaseFile(_Model):
     texts: dict[str, str] = {}
     area: list[AreaText]
 
-    def cases(self, link: str, names: Mapping[str, str]) -> Iterator[Case[LinkProbe]]:
-        """Yield the cases for a link; `names` are its names in braces."""
-        known = {**names, **self.texts}
-        for area in self.area:
-            for item in area.cases if link in area.links else ():
-                with suppress(KeyError):
-                    texts = item.id, item.title, item.clause or area.clause, item.lines
-                    name, title, clause, lines = (text.format(**known) for text in texts)
-                    changes = area.intrusive if item.intrusive is None else item.intrusive
-                    yield case_in(area.name, name, title, partial(hold, lines), clause, intrusive=changes)
 
-
-def read_case_file(path: Path) -> CaseFile:
+def _read(path: Path) -> CaseFile:
     """Read a file of cases.
 
     Raises BenchError: it is not one; the text names all errors.
     """
     try:
         document = tomllib.loads(read_user_text(path))
-        return CaseFile.model_validate(document)
+        file = CaseFile.model_validate(document)
     except ValidationError as error:
         raise BenchError(*(f"{path}: {item}" for item in problems(error, CaseFile, document))) from None
     except (OSError, ValueError) as error:
         raise BenchError(f"{path}: {reason(error)}") from None
+    found = [
+        f"{path}: {area.name}.{item.id}: {step}: {fault}"
+        for area in file.area
+        if area.links != ["canopen"]
+        for item in area.cases
+        for step in _steps(item.lines)
+        if (fault := _fault(step))
+    ]
+    if found:
+        raise BenchError(*found)
+    return file
+
+
+def _steps(lines: str) -> list[str]:
+    """Return the steps of a case, with repeated texts written out."""
+    whole = REPEATED.sub(lambda found: found[1] * int(found[2]), lines.strip())
+    return [step.strip() for step in re.split("[;\n]", whole) if step.strip()]
+
+
+def _fault(step: str) -> str | None:
+    """Return what is wrong with a step; None if nothing is, or if that depends on names in braces."""
+    verb, *words = step.split()
+    counts = VERBS.get(verb)
+    if "{" in step:
+        return None
+    if counts is not None:
+        numbers = verb in ("silence", "sleep")
+        right = len(words) in counts and (not numbers or all(map(SECONDS.fullmatch, words)))
+        return None if right else f"wrong words after {verb!r}"
+    sent, _, answers = step.partition(">")
+    raw = all(map(SENT.fullmatch, sent.split())) and all(map(ANSWER.fullmatch, answers.split()))
+    return None if raw and sent else f"neither raw traffic nor a known step{did_you_mean(verb, VERBS)}"
 
 
 def hold(lines: str, probe: LinkProbe) -> None:
     """Carry out the steps of a case."""
-    for step in re.split("[;\n]", REPEATED.sub(lambda found: found[1] * int(found[2]), lines.strip())):
+    for step in _steps(lines):
         match step.split():
             case "silence", *seconds:
                 probe.expect_silence("nothing was requested", float(seconds[0]) if seconds else None)
@@ -118,11 +153,13 @@ def hold(lines: str, probe: LinkProbe) -> None:
             case "drain", *_:
                 probe.drain()
             case "command", name:
+                check(name in probe.unit.telecommands, f"a telecommand {name!r} in the definition", "none")
                 probe.command(name)
             case "telemetry", name, *values:
+                check(name in probe.unit.telemetry, f"telemetry {name!r} in the definition", "none")
                 wanted = {key: _value(text) for key, _, text in (item.partition("=") for item in values)}
                 seen = probe.telemetry(name)
-                check_equal({key: seen[key] for key in wanted}, wanted, name)
+                check_equal({key: seen.get(key, "no such field") for key in wanted}, wanted, name)
             case _:
                 sent, _, answers = step.partition(">")
                 probe.exchange(sent, answers.split())
@@ -136,3 +173,30 @@ def _value(text: str) -> Any:
     with suppress(ValueError):
         return json.loads(text)
     return text
+
+
+def text_cases(
+    path: Path,
+    link: str,
+    names: dict[str, str],
+    run: Callable[[str, Any], None] = hold,
+    faults: Callable[[str], Iterable[str]] = lambda _lines: (),
+) -> list[Case[Any]]:
+    """Return the cases of a file for a link; `names` are its names in braces, `run` carries out lines with a probe.
+
+    Raises BenchError: the file cannot be read, has errors, or `faults` finds some in lines; one line for each.
+    """
+    file = _read(path)
+    known = ChainMap(file.texts, names)
+    found, wrong = [], []
+    for area in file.area:
+        for item in area.cases if link in area.links else ():
+            with suppress(KeyError):
+                texts = item.id, item.title, item.clause or area.clause, item.lines
+                name, title, clause, lines = (text.format_map(known) for text in texts)
+                changes = area.intrusive if item.intrusive is None else item.intrusive
+                found.append(case_in(area.name, name, title, partial(run, lines), clause, intrusive=changes))
+                wrong += [f"{path}: {area.name}.{name}: {fault}" for fault in faults(lines)]
+    if wrong:
+        raise BenchError(*wrong)
+    return found

@@ -21,7 +21,7 @@ from starhil.hil_tests.conformance.case import (
     check_equal,
     rule,
 )
-from starhil.hil_tests.conformance.case_file import CUBESPACE_CASES, read_case_file
+from starhil.hil_tests.conformance.case_file import CUBESPACE_CASES, text_cases
 from starhil.hil_tests.conformance.link_probe import INVALID_ID, lively_row
 from starhil.hil_tests.conformance.row_cases import CLOCK_S, row_cases
 from starhil.hil_tests.conformance.serial_probe import BITS_A_BYTE, SerialProbe
@@ -50,7 +50,7 @@ def serial_cases(unit: Unit) -> Iterator[Case[Any]]:
     yield from _framing(line, framing, in_text=bool(lively.request))
     highest = 255
     if line.dialect is not None:
-        yield from read_case_file(CUBESPACE_CASES).cases("serial", serial_names(unit))
+        yield from text_cases(CUBESPACE_CASES, "serial", serial_names(unit))
     texts = [row for row in unit.rows if row.request]
     if texts:
         yield from _texts(texts)

@@ -45,6 +45,26 @@ clause = "ICD 4.4"
 lines = "40 00 10 00 > 43 *"
 """
 )
+PYTHON = """
+from starhil.hil_tests.conformance.case import CaseArea
+
+DEVICE = CaseArea("device", "ICD 4.6", links=("canopen",))
+OTHER = CaseArea("other", "ICD 4.7")
+
+
+@DEVICE.case("type", "1000h has 4 bytes")
+def device_type(probe):
+    assert len(probe.read(0x1000)) == 4
+
+
+@OTHER.case("none", "not on CANopen")
+def none(probe):
+    raise AssertionError
+
+
+def generated(unit):
+    raise AssertionError
+"""
 
 
 def case_file(folder: Path, dialogue: str) -> Path:
@@ -59,24 +79,26 @@ def test_dialogues_of_a_unit_are_run_with_the_other_cases(tmp_path: Path) -> Non
     folder = Path(shutil.copytree(find_unit("oresat"), tmp_path / "unit"))
     (folder / "modes_cases.toml").write_text(OWN, encoding="utf-8")
     (folder / "filter_cases.toml").write_text(EXAMPLE, encoding="utf-8")
+    (folder / "device_cases.py").write_text(PYTHON, encoding="utf-8")
     cases = {case.id: case for case in canopen_suite(read_unit(folder))}
     plain = {case.id for case in canopen_suite(read_unit("oresat"))}
-    assert cases.keys() - plain == {"canopen.filter.kept", "canopen.modes.wrong"}
-    own = [cases[f"canopen.{name}"] for name in ("filter.kept", "nmt.boot-up", "modes.wrong")]
+    assert cases.keys() - plain == {"canopen.filter.kept", "canopen.device.type", "canopen.modes.wrong"}
+    own = [cases[f"canopen.{name}"] for name in ("filter.kept", "device.type", "nmt.boot-up", "modes.wrong")]
     assert [(case.clause, case.intrusive) for case in own] == [
         ("ICD 4.5", True),
+        ("ICD 4.6", False),
         ("ICD 4.4", False),
         ("ICD 4.2", False),
     ]
     with SimulatedUnit("canopen", unit=folder) as simulated:
-        passed, replaced, failed = run_cases(simulated.probe, own)
-    assert [item.status for item in (passed, replaced, failed)] == ["passed", "passed", "failed"], passed
+        outcomes = run_cases(simulated.probe, own)
+    assert [item.status for item in outcomes] == ["passed", "passed", "passed", "failed"], outcomes
 
 
 def test_the_lines_after_finally_are_held_after_a_failure_which_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "modes_cases.toml"
     path.write_text(OWN, encoding="utf-8")
-    case = next(case for case in dialogue_cases(path) if case.id == "canopen.modes.wrong")
+    case = next(case for case in dialogue_cases(path) if case.id == "modes.wrong")
     with SimulatedUnit("canopen") as simulated:
         outcome = run_case(simulated.probe, case)
         assert simulated.probe.number(0x1017) == 777

@@ -76,6 +76,46 @@ def test_a_row_that_reports_the_start_is_awaited_after_a_reset(
     assert outcome.status == status
 
 
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        (
+            "telemetri status a=1",
+            "telemetri status a=1: neither raw traffic nor a known step; did you mean telemetry?",
+        ),
+        ("drain; silence soon", "silence soon: wrong words after 'silence'"),
+        ("sleep", "sleep: wrong words after 'sleep'"),
+        ("1F 7", "1F 7: neither raw traffic nor a known step"),
+        ("1F 7F > ack", "1F 7F > ack: neither raw traffic nor a known step"),
+    ],
+)
+def test_a_wrong_step_of_a_file_is_named_before_the_run(lines: str, message: str, tmp_path: Path) -> None:
+    folder = unit_with(tmp_path / "unit", "")
+    path = folder / "more_cases.toml"
+    path.write_text(
+        f'[[area]]\nname = "more"\nclause = "ICD 5"\ncases = [{{ id = "a", title = "t", lines = "{lines}" }}]\n'
+    )
+    with pytest.raises(BenchError) as caught:
+        serial_suite(read_unit(folder))
+    assert str(caught.value) == f"{path}: more.a: {message}"
+
+
+def test_a_step_with_a_row_or_field_that_the_unit_lacks_fails_its_case(tmp_path: Path) -> None:
+    folder = unit_with(tmp_path / "unit", "")
+    (folder / "more_cases.toml").write_text(
+        '[[area]]\nname = "more"\nclause = "ICD 5"\ncases = [\n'
+        '    { id = "a", title = "t", lines = "command nothing" },\n'
+        '    { id = "b", title = "t", lines = "telemetry nothing a=1" },\n'
+        '    { id = "c", title = "t", lines = "telemetry attitude nothing=1" },\n]\n'
+    )
+    cases = [case for case in serial_suite(read_unit(folder)) if case.area == "serial.more"]
+    with SimulatedUnit("serial", unit=folder) as simulated:
+        expected = [run_case(simulated.probe, case).detail for case in cases]
+    assert "a telecommand 'nothing' in the definition" in expected[0]
+    assert "telemetry 'nothing' in the definition" in expected[1]
+    assert "no such field" in expected[2]
+
+
 def test_own_cases_are_run_with_those_of_the_definition(tmp_path: Path) -> None:
     folder = unit_with(tmp_path / "unit", OWN.replace("BOOTED", "1"))
     derived = {case.id for case in serial_suite(read_unit(write_unit(tmp_path / "plain", "sum")))}

@@ -133,3 +133,5 @@ def test_a_unit_without_cases_for_a_link_is_named() -> None:
         serial_suite(read_unit("oresat"))
     with pytest.raises(BenchError, match="unit sagitta: has no CAN link"):
         can_suite(read_unit("sagitta"))
+    with pytest.raises(BenchError, match="unit sagitta: has no CANopen link"):
+        canopen_suite(read_unit("sagitta"))
