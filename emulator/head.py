@@ -44,11 +44,10 @@ from starhil.emulator.truth.truth import SensorTruth, Truth
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.serial_stack import chosen_dialect
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
-from starhil.protocol.values import IcdError
 
 log = logging.getLogger("starhil.run")
 

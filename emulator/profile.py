@@ -42,11 +42,10 @@ from starhil.emulator.truth.config import (
     TruthConfig,
     UserPath,
 )
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import DEFAULT_UNIT, bundled_units, find, not_found, remedy
 from starhil.protocol.validation_messages import problems
-from starhil.protocol.values import IcdError
 from starid.earth import unix_time
 
 if TYPE_CHECKING:

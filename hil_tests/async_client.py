@@ -265,7 +265,7 @@ class AsyncObcClient:
         """Return whether a reply answers a request; a telecommand may be answered with a telemetry row."""
         if reply.id is None or (reply.id, reply.klass) == (request.id, request.klass):
             return reply.kind in _ANSWERS[request.kind]
-        row, answer = self.icd.rows_by_key.get((request.klass, request.id)), self._row_of(reply)
+        row, answer = self.icd.row(request.id, request.klass), self._row_of(reply)
         return row is not None and answer is not None and f"row:{answer.name}" in row.answers
 
     def _on_unsolicited(self, reply: Reply) -> None:
@@ -280,7 +280,7 @@ class AsyncObcClient:
             queue.put_nowait(self._reading(reply, 0.0))
 
     def _row_of(self, reply: Reply) -> Row | None:
-        return None if reply.id is None else self.icd.rows_by_key.get((reply.klass, reply.id))
+        return None if reply.id is None else self.icd.row(reply.id, reply.klass)
 
     def _reading(self, reply: Reply, latency: float) -> Reading:
         row = self._row_of(reply)

@@ -6,14 +6,14 @@ from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import HostLink
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError, error_of
 from starhil.protocol.canopen.cob import SDO_RECEIVE, SDO_TRANSMIT
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
-from starhil.protocol.canopen.sdo_client import ERROR_OF_ABORT, SdoTransfer, row_transfer
+from starhil.protocol.canopen.sdo_client import SdoTransfer, row_transfer
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.errors import IcdError
+from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.transports import open_can
-from starhil.protocol.values import IcdError
 
 
 class CanopenHostLink(HostLink[CanFrame]):
@@ -38,7 +38,7 @@ class CanopenHostLink(HostLink[CanFrame]):
 
         Raises BenchError: the object dictionary does not hold the row.
         """
-        row = self._icd.rows_by_key.get((request.klass, request.id))
+        row = self._icd.row(request.id, request.klass)
         if row is None:
             raise BenchError(f"{self.description}: request {request.id} is not in the object dictionary")
         try:
@@ -68,7 +68,7 @@ class CanopenHostLink(HostLink[CanFrame]):
             kind = ReplyKind.ACK if request.kind is RequestKind.TELECOMMAND else ReplyKind.TELEMETRY
             return self._reply(Reply(kind, request.id, done.value, klass=request.klass))
         except SdoAbortError as abort:
-            code = self._icd.error_number(ERROR_OF_ABORT.get(abort.code, ErrorCode.INTERNAL))
+            code = self._icd.error_number(error_of(abort.code))
             return self._reply(Reply(ReplyKind.NACK, request.id, code=code, klass=request.klass))
         return []
 

@@ -11,6 +11,7 @@ from typing import Final, assert_never
 import xxhash
 
 from starhil.protocol.conventions import Order
+from starhil.protocol.errors import IcdError
 from starhil.protocol.link_schema import (
     CheckModel,
     CrcCheck,
@@ -21,7 +22,7 @@ from starhil.protocol.link_schema import (
     XorCheck,
     XxHashCheck,
 )
-from starhil.protocol.values import SCALAR_SIZES, IcdError
+from starhil.protocol.values import SCALAR_SIZES
 
 CheckFunction = Callable[[bytes], bytes]
 

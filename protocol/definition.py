@@ -81,41 +81,40 @@ class InterfaceDefinition:
         return device_model()
 
     @cached_property
-    def telecommands_by_id(self) -> Mapping[int, Row]:
-        """Telecommands by ID."""
-        return {row.id: row for row in self.telecommands.values()}
+    def _rows_by_key(self) -> Mapping[tuple[str, int], Row]:
+        """Rows by class and ID, and the first row with each ID by the class ""."""
+        rows = tuple(self.rows)
+        first = {("", row.id): row for row in reversed(rows)}
+        return first | {(row.klass, row.id): row for row in rows}
 
     @cached_property
-    def telemetry_by_id(self) -> Mapping[int, Row]:
-        """Telemetry by ID."""
-        return {row.id: row for row in self.telemetry.values()}
-
-    @cached_property
-    def rows_by_key(self) -> Mapping[tuple[str, int], Row]:
-        """Rows by class and ID."""
-        return {(row.klass, row.id): row for row in self.rows}
+    def classes_by_name(self) -> Mapping[str, MessageClass]:
+        """Classes by name."""
+        return {item.name: item for item in self.classes}
 
     @cached_property
     def parameters_by_id(self) -> Mapping[int, Parameter]:
         """Parameters by ID."""
         return {parameter.id: parameter for parameter in self.parameters.values()}
 
-    def row_by_id(self, row_id: int) -> Row | None:
-        """Return the telecommand or telemetry row with this ID, or None."""
-        telemetry = self.kind_of_id(row_id) is RequestKind.TELEMETRY
-        return (self.telemetry_by_id if telemetry else self.telecommands_by_id).get(row_id)
+    def row(self, row_id: int, klass: str = "") -> Row | None:
+        """Return the row with this ID in a class, or the first of any class; None if there is none."""
+        return self._rows_by_key.get((klass, row_id))
 
     def telemetry_row(self, row_id: int, klass: str | None = None) -> Row | None:
-        """Return the telemetry row with this ID in a class (default: the first that has it), or None."""
-        names = [item.name for item in self.classes if klass in (None, item.name)] or [""]
-        found = (self.rows_by_key.get((name, row_id)) for name in names)
-        return next((row for row in found if row is not None and row.kind == "telemetry"), None)
+        """Return the telemetry row with this ID in a class (default: the first of any class), or None."""
+        rows = (row for row in self.telemetry.values() if row.id == row_id)
+        return next((row for row in rows if klass in (None, row.klass)), None)
 
-    def kind_of_id(self, row_id: int) -> RequestKind:
-        """Return the kind of an ID in a unit without classes; an unknown ID is taken as a telecommand."""
-        first = self.first_telemetry_id
-        telemetry = row_id in self.telemetry_by_id if first is None else row_id >= first
-        return RequestKind.TELEMETRY if telemetry else RequestKind.TELECOMMAND
+    def kind_of(self, row_id: int, klass: str = "") -> RequestKind:
+        """Return the kind of an ID, which need not belong to a row; without a class, an unknown one is a telecommand."""
+        if klass in self.classes_by_name:
+            return self.classes_by_name[klass].kind
+        if self.first_telemetry_id is not None:
+            telemetry = row_id >= self.first_telemetry_id
+            return RequestKind.TELEMETRY if telemetry else RequestKind.TELECOMMAND
+        row = self.row(row_id)
+        return RequestKind.TELECOMMAND if row is None else row.kind
 
     @staticmethod
     def request(row: Row, data: bytes = b"", source: int = 0) -> Request:
@@ -127,14 +126,13 @@ class InterfaceDefinition:
 
         The default class is that of the first row with this ID, or the first class if there is none.
         """
-        if not self.classes:
-            return Request(self.kind_of_id(row_id), row_id, data)
-        kinds = {item.name: item.kind for item in self.classes}
-        if klass is None:
-            klass = next((row.klass for row in self.rows if row.id == row_id), self.classes[0].name)
-        if klass not in kinds:
-            raise UnknownNameError(f"no class named {klass!r}; the unit has {', '.join(kinds)}")
-        return Request(kinds[klass], row_id, data, klass=klass)
+        classes = self.classes_by_name
+        if klass is None or not classes:
+            row = self.row(row_id)
+            klass = next(iter(classes), "") if row is None else row.klass
+        elif klass not in classes:
+            raise UnknownNameError(f"no class named {klass!r}; the unit has {', '.join(classes)}")
+        return Request(self.kind_of(row_id, klass), row_id, data, klass=klass)
 
     def error_number(self, code: ErrorCode) -> ErrorCode | int:
         """Return the unit's code for an error."""

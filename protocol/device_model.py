@@ -15,6 +15,7 @@ from typing import Final, TypeVar
 
 from pydantic import ValidationError
 
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd_schema import (
     ActionModel,
     ArgumentModel,
@@ -23,7 +24,7 @@ from starhil.protocol.icd_schema import (
 )
 from starhil.protocol.names import UNITS_FOLDER, did_you_mean
 from starhil.protocol.user_file import read_user_text
-from starhil.protocol.values import EnumDefinition, IcdError, Parameter
+from starhil.protocol.values import EnumDefinition, Parameter
 
 MODEL_FILE: Final = UNITS_FOLDER / "model.toml"
 

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 from starhil.protocol.conventions import Order
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.link_schema import HeaderFieldModel
-from starhil.protocol.values import IcdError
 
 WRAPPING: Final = frozenset(("ticks", "time", "sequence"))
 """Roles whose values wrap around."""

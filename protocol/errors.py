@@ -21,6 +21,10 @@ class ProtocolError(OneLineError):
     """Invalid bytes, frames, values or definitions."""
 
 
+class IcdError(ProtocolError):
+    """An invalid interface definition; the text names file, row and field."""
+
+
 def reason(error: Exception) -> str:
     """Return the reason of a failure: the system's message for the error number, or else the error's text.
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, TypeVar, assert_never
 
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.link_schema import (
     ByteStuffing,
     CubeSpaceFraming,
@@ -28,7 +28,6 @@ from starhil.protocol.link_schema import (
 )
 from starhil.protocol.messages import FaultKind, LinkFault, Receiver
 from starhil.protocol.plugin import guarded
-from starhil.protocol.values import IcdError
 
 _Message = TypeVar("_Message")
 

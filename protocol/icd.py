@@ -22,7 +22,7 @@ from starhil.protocol import icd_schema as schema
 from starhil.protocol.codec import Row
 from starhil.protocol.conventions import Conventions
 from starhil.protocol.definition import OTHER_ERROR, InterfaceDefinition, Names
-from starhil.protocol.errors import escape_controls
+from starhil.protocol.errors import IcdError, escape_controls
 from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import NUMBER, Layout, enum_of
 from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageClass
@@ -33,7 +33,13 @@ from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import Problem, problems
-from starhil.protocol.values import FieldError, IcdError, Located, MissingNameError, Parameter, Section
+from starhil.protocol.values import (
+    FieldError,
+    Located,
+    MissingNameError,
+    Parameter,
+    Section,
+)
 
 _Item = TypeVar("_Item")
 

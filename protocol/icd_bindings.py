@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.device_model import DeviceModel, generic
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd_schema import ActionModel, ArgumentModel, QuantityModel
 from starhil.protocol.names import did_you_mean
 from starhil.protocol.units_of_measure import convertible, factor
-from starhil.protocol.values import IcdError
 
 ANY_UNIT = "*"
 SET_PARAMETERS = "set_parameters"

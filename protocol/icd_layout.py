@@ -20,6 +20,7 @@ from pydantic import ValidationError
 from starhil.protocol.codec import Field, FieldKind, Row, Slot
 from starhil.protocol.conventions import Order
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd_schema import BitModel, FieldKeys, FieldModel, Provenance
 from starhil.protocol.messages import RequestKind
 from starhil.protocol.names import did_you_mean
@@ -28,7 +29,6 @@ from starhil.protocol.values import (
     INTEGER_RANGES,
     SCALAR_SIZES,
     EnumDefinition,
-    IcdError,
     Located,
     MissingNameError,
     Scalar,

@@ -15,10 +15,10 @@ from typing import Final, TypeVar
 
 from starhil.protocol.checks import Check
 from starhil.protocol.envelope import Envelope, Header, HeaderError
+from starhil.protocol.errors import IcdError
 from starhil.protocol.framings import BodySizeError, Deframer, Framing, Receiving
 from starhil.protocol.link_schema import FixedFraming, FramingModel, SerialLinkModel
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind
-from starhil.protocol.values import IcdError
 
 _Message = TypeVar("_Message")
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
-from starhil.protocol.values import IcdError
+from starhil.protocol.errors import IcdError
 
 _MIN_SIMILARITY: Final = 0.55
 """Similarity above which a known name is suggested for an unknown one (`difflib`)."""

@@ -29,9 +29,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.user_file import read_user_file
-from starhil.protocol.values import IcdError
 
 Function = TypeVar("Function")
 Arguments = ParamSpec("Arguments")

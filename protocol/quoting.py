@@ -12,7 +12,7 @@ import textwrap
 from collections.abc import Iterable
 from typing import Final
 
-from starhil.protocol.values import IcdError
+from starhil.protocol.errors import IcdError
 
 _WIDTH: Final = 107
 """Width of the text in a C comment."""

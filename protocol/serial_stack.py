@@ -22,7 +22,7 @@ from starhil.protocol.codec import Row
 from starhil.protocol.cubespace import Dialect, DialectReplies
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.envelope import Envelope, Header, HeaderError
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.framings import Deframer, Receiving, build_framing
 from starhil.protocol.link_schema import (
     CubeSpaceFraming,
@@ -43,35 +43,9 @@ from starhil.protocol.messages import (
     RequestKind,
     error_code,
 )
-from starhil.protocol.values import IcdError
 
 LINK_FORMAT: Final = FormatModel()
 """The framing and check of the link itself."""
-
-
-class _Classes:
-    """The classes of a unit by code and by name."""
-
-    def __init__(self, classes: Sequence[MessageClass]) -> None:
-        self.classes: Final = classes
-        self.by_name: Final = {item.name: item for item in classes}
-        coded = [item for item in classes if item.code is not None]
-        self.requests: Final = {item.code: item.name for item in coded if item.code is not None}
-        self.replies: Final = {
-            code: item.name
-            for item in coded
-            for code in (item.reply_code, item.unsolicited)
-            if code is not None
-        }
-        self.unsolicited: Final = {item.unsolicited for item in coded} - {None}
-        """Codes of unsolicited telemetry."""
-
-    def coded(self, name: str) -> MessageClass:
-        """Return a class; raise ProtocolError if the link has no code for it."""
-        item = self.by_name.get(name)
-        if item is None or item.code is None:
-            raise ProtocolError(f"class {name!r} has no code on this link")
-        return item
 
 
 class SerialStack:
@@ -91,15 +65,16 @@ class SerialStack:
             raise IcdError(f"unit {icd.name}: has no serial link")
         link, rows = icd.link.serial, tuple(icd.rows)
         self.link: Final = link
-        self.classes: Final = _Classes(icd.classes)
+        self.icd: Final = icd
+        self.classes: Final = icd.classes_by_name
+        self.unsolicited: Final = {item.unsolicited for item in icd.classes if item.code is not None} - {None}
+        """Class codes of unsolicited telemetry."""
         self.rows: Final = rows
         self.byte_order: Final = icd.conventions.byte_order
         self.dialects: Final = dialects_of(link)
         self._plugin = icd.plugin
         self._unanswered = link.framing.unanswered if isinstance(link.framing, CubeSpaceFraming) else []
         self._silent = {row.id for row in rows if not self.answers(row)}
-        self._rows = icd.rows_by_key
-        self._rows_by_id = {row.id: row for row in reversed(rows)}
         self._by_text = {words(row.request): row for row in rows if row.request}
         self._unknown_id = max((row.id for row in rows), default=0) + 1
         """ID of a request with an unknown text."""
@@ -127,7 +102,7 @@ class SerialStack:
         headers += [head for replies in self._in_dialect.values() for head in replies.headers.values()]
         longest = (
             max((row.size for row in rows), default=0)
-            + max(head.size(name) for head in headers for name in ("", *self.classes.by_name))
+            + max(head.size(name) for head in headers for name in ("", *self.classes))
             + max(form.check.size for form in (*self.request_formats.all, *self.reply_formats.all))
         )
         self.max_size: Final = link.max_size or max(DEFAULT_MAX_SIZE, longest)
@@ -153,8 +128,8 @@ class SerialStack:
 
     def _check_classes(self, names: Sequence[str] | None, where: str) -> None:
         for name in names or ():
-            if name not in self.classes.by_name:
-                known = ", ".join(self.classes.by_name) or "none"
+            if name not in self.classes:
+                known = ", ".join(self.classes) or "none"
                 raise IcdError(f"{where}: no class named {name!r} (known: {known})")
 
     def _format(
@@ -164,7 +139,13 @@ class SerialStack:
         frames = build_framing(framing, self._plugin.framings)
         checks = build_check(check, self.byte_order, self._plugin.checks)
         overhead = {"start": len(frames.start), "check": checks.size, "end": len(frames.end)}
-        codes = self.classes.requests if name == "request_header" else self.classes.replies
+        codes = {
+            code: klass
+            for klass, coded in self.classes.items()
+            if coded.code is not None
+            for code in ((coded.code,) if name == "request_header" else (coded.reply_code, coded.unsolicited))
+            if code is not None
+        }
         header = Header(models, self.byte_order, codes, overhead, f"link.serial.{name}")
         return MessageFormat(frames, framing, checks, header, item.classes or ())
 
@@ -201,11 +182,12 @@ class SerialStack:
             if role in header.roles:
                 raise IcdError(f"link.serial.{where}_header: role {role} belongs to the other direction")
 
-    def row(self, klass: str, row_id: int) -> Row | None:
-        """Return the row of a message; the class matters only if the link carries one."""
-        if "class" in self.requests.header.roles:
-            return self._rows.get((klass, row_id))
-        return self._rows.get((klass, row_id)) or self._rows_by_id.get(row_id)
+    def _coded(self, name: str) -> MessageClass:
+        """Return a class; raise ProtocolError if the link has no code for it."""
+        item = self.classes.get(name)
+        if item is None or item.code is None:
+            raise ProtocolError(f"class {name!r} has no code on this link")
+        return item
 
     def supports_unsolicited(self, dialect: Dialect | None = None) -> bool:
         """Return whether this dialect has unsolicited telemetry."""
@@ -241,7 +223,7 @@ class SerialStack:
         """Return header, data and check of a request."""
         form = self.request_formats.of(request.klass)
         if form in self.text_formats:
-            row = self.row(request.klass, request.id)
+            row = self.icd.row(request.id, request.klass)
             if row is None or not row.request or request.data:
                 what = f"no text requests ID {request.id}" if row is None else "a text has no data"
                 raise ProtocolError(f"link.serial: {what}")
@@ -252,7 +234,7 @@ class SerialStack:
         if request.flags:
             values["flags"] = request.flags
         if "class" in self.requests.header.roles:
-            values["class"] = self.classes.coded(request.klass).code or 0
+            values["class"] = self._coded(request.klass).code or 0
         return form.close(form.header.pack(values, request.klass, len(request.data)), request.data)
 
     def encode_reply(self, reply: Reply, dialect: Dialect | None = None) -> bytes:
@@ -292,7 +274,7 @@ class SerialStack:
         if "time" in header.roles:
             values["time"] = reply.time_ns // header.count_ns("time")
         if "class" in header.roles:
-            item = self.classes.coded(reply.klass)
+            item = self._coded(reply.klass)
             unsolicited = reply.kind is ReplyKind.UNSOLICITED
             values["class"] = (item.unsolicited_code if unsolicited else item.reply_code) or 0
         data = b"" if refused else reply.data
@@ -315,10 +297,10 @@ class SerialStack:
         values = envelope.values
         row_id, klass = values["id"], envelope.klass
         if not klass:
-            row = self.row(klass, row_id)
+            row = self.icd.row(row_id)
             klass = row.klass if row is not None else ""
         return Request(
-            self.kind_of(row_id, klass) or RequestKind.TELECOMMAND,
+            self.icd.kind_of(row_id, klass),
             row_id,
             data,
             values.get("source", 0),
@@ -327,14 +309,6 @@ class SerialStack:
             values.get("flags", 0),
         )
 
-    def kind_of(self, row_id: int, klass: str = "") -> RequestKind | None:
-        """Return the kind of a row, which need not exist; None if it is unknown."""
-        if self.dialects:
-            return RequestKind.of(row_id)
-        item = self.classes.by_name.get(klass)
-        row = self.row(klass, row_id)
-        return item.kind if item is not None else row.kind if row is not None else None
-
     def _request_size(self, form: MessageFormat, body: bytes) -> int | None:
         """Return the size of a request that begins with these bytes, or None if more are needed."""
         if form.request_size is not None:
@@ -342,7 +316,7 @@ class SerialStack:
         return form.measure(body, self._request_data_size)
 
     def _request_data_size(self, envelope: Envelope) -> int:
-        row = self.row(envelope.klass, envelope.values["id"])
+        row = self.icd.row(envelope.values["id"], envelope.klass)
         if row is None:
             raise HeaderError(f"no row with id {envelope.values['id']}")
         return row.request_size
@@ -387,7 +361,7 @@ class HostReceiver:
 
     def expect(self, request: Request) -> None:
         """Set the next request."""
-        row = self._stack.row(request.klass, request.id)
+        row = self._stack.icd.row(request.id, request.klass)
         answers = self._stack.answers(row) if row is not None else ("reply",)
         self._pending = request
         self._reply_size = row.reply_size if row is not None else 0
@@ -411,10 +385,12 @@ class HostReceiver:
         values = envelope.values
         if values.get("status", 0) or not values.get("ack", 1):
             return 0
-        row = self._stack.row(envelope.klass, values["id"]) if "id" in values else None
+        pending = self._awaited(form)
+        row_id = values.get("id")
+        row = None if row_id is None else self._stack.icd.row(row_id, _class_of(envelope, row_id, pending))
         if row is not None:
             return row.reply_size
-        if self._awaited(form) is None:
+        if pending is None:
             raise HeaderError("reply without a request")
         return self._reply_size
 
@@ -435,9 +411,7 @@ class HostReceiver:
         row_id = values.get("id", None if pending is None else pending.id)
         if row_id is None:
             return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
-        klass = envelope.klass
-        if not klass and pending is not None and pending.id == row_id:
-            klass = pending.klass
+        klass = _class_of(envelope, row_id, pending)
         kind = self._kind(envelope, klass, row_id)
         if kind is ReplyKind.ACK and not values and stack.texts.acknowledge is not None:
             return LinkFault(FaultKind.UART_PROTOCOL, f"{body[:16]!r} is no acknowledge")
@@ -479,9 +453,9 @@ class HostReceiver:
         values, stack = envelope.values, self._stack
         if values.get("status", 0) or not values.get("ack", 1):
             return ReplyKind.NACK
-        if values.get("class") in stack.classes.unsolicited:
+        if values.get("class") in stack.unsolicited:
             return ReplyKind.UNSOLICITED
-        telecommand = stack.kind_of(row_id, klass) is RequestKind.TELECOMMAND
+        telecommand = stack.icd.kind_of(row_id, klass) is RequestKind.TELECOMMAND
         return ReplyKind.ACK if telecommand else ReplyKind.TELEMETRY
 
     def _reply_in_dialect(self, in_dialect: DialectReplies, body: bytes) -> Reply | LinkFault:
@@ -489,6 +463,13 @@ class HostReceiver:
         if isinstance(reply, Reply) and reply.kind in (ReplyKind.ACK, ReplyKind.NACK, ReplyKind.TELEMETRY):
             self._pending = None
         return reply
+
+
+def _class_of(envelope: Envelope, row_id: int, pending: Request | None) -> str:
+    """Return the class of a reply, or of the request that it answers if its header has none."""
+    if not envelope.klass and pending is not None and pending.id == row_id:
+        return pending.klass
+    return envelope.klass
 
 
 def dialects_of(link: SerialLinkModel | None) -> tuple[Dialect, ...]:

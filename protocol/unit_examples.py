@@ -11,7 +11,7 @@ from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.icd import read_definition
 from starhil.protocol.icd_bindings import unbound
 from starhil.protocol.link_schema import CustomFraming
@@ -19,7 +19,7 @@ from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.names import find_unit
 from starhil.protocol.plugin import guarded
 from starhil.protocol.serial_stack import SerialStack, chosen_dialect
-from starhil.protocol.values import IcdError, Value
+from starhil.protocol.values import Value
 
 HOST_ADDRESS, DEVICE_ADDRESS = 1, 4
 """CAN addresses in the examples."""

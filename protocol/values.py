@@ -15,8 +15,9 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.names import did_you_mean
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 ParameterType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64", "bool", "enum8"]
@@ -53,10 +54,6 @@ SCALAR_SIZES: Final[Mapping[str, int]] = MappingProxyType(
 
 F32_MAX: Final = 3.4028234663852886e38
 """Largest finite single-precision number."""
-
-
-class IcdError(ProtocolError):
-    """An invalid interface definition; the text names file, row and field."""
 
 
 class Located:
@@ -156,7 +153,8 @@ class EnumDefinition(DefinitionModel):
         elif isinstance(name, (int, float)) and name in self.names:
             return int(name)
         allowed = ", ".join(f"{name} ({number})" for name, number in self.values.items())
-        raise FieldError(f"{value!r} is not one of {allowed}")
+        hint = did_you_mean(value, self.values) if isinstance(value, str) else ""
+        raise FieldError(f"{value!r} is not one of {allowed}{hint}")
 
 
 def to_f32(value: float) -> float:

@@ -149,14 +149,12 @@ class Decoder:
         if self._icd.link.can is None:
             return "29-bit frame"
         number = CanId.unpack(item.id).id
-        row = self._icd.row_by_id(number)
+        row = self._icd.row(number)
         return f"segment of {row.name if row is not None else number}"
 
     def row_of(self, message: Request | Reply) -> Row | None:
-        """Return the row of a message by class and ID, or else by ID alone."""
-        if message.id is None:
-            return None
-        return self._icd.rows_by_key.get((message.klass, message.id)) or self._icd.row_by_id(message.id)
+        """Return the row of a message by class and ID, or by ID alone if it has no class."""
+        return None if message.id is None else self._icd.row(message.id, message.klass)
 
     def _text(self, event: Request | Reply | LinkFault) -> tuple[str, str]:
         if isinstance(event, LinkFault):

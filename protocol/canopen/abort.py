@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from typing import Final
 
 from canopen import SdoAbortedError
 
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import ErrorCode
 
 
 class AbortCode(IntEnum):
@@ -37,6 +39,22 @@ class AbortCode(IntEnum):
     NOT_STORED = 0x08000020
     DEVICE_STATE = 0x08000022
     NO_DATA = 0x08000024
+
+
+ABORTS: Final = {
+    ErrorCode.INVALID_ID: (AbortCode.NO_OBJECT, AbortCode.NO_SUBINDEX),
+    ErrorCode.INVALID_LENGTH: (AbortCode.LENGTH, AbortCode.LENGTH_HIGH, AbortCode.LENGTH_LOW),
+    ErrorCode.INVALID_PARAMETER: (AbortCode.VALUE_RANGE, AbortCode.VALUE_HIGH, AbortCode.VALUE_LOW),
+    ErrorCode.NOT_IMPLEMENTED: (AbortCode.UNSUPPORTED_ACCESS,),
+    ErrorCode.BUSY: (AbortCode.DEVICE_STATE,),
+    ErrorCode.SEQUENCE: (AbortCode.DEVICE_STATE,),
+}
+"""Abort codes of each published error code, of which the node sends the first."""
+
+
+def error_of(abort: int) -> ErrorCode:
+    """Return the first published error code that has an abort code; internal error if none has it."""
+    return next((error for error, aborts in ABORTS.items() if abort in aborts), ErrorCode.INTERNAL)
 
 
 class SdoAbortError(ProtocolError):

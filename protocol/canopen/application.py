@@ -5,20 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.abort import ABORTS, AbortCode, SdoAbortError
 from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.codec import Row
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import LengthError, MessageError, Value
-
-STATUS_ABORTS = {
-    ErrorCode.INVALID_ID: AbortCode.NO_OBJECT,
-    ErrorCode.INVALID_LENGTH: AbortCode.LENGTH,
-    ErrorCode.INVALID_PARAMETER: AbortCode.VALUE_RANGE,
-    ErrorCode.NOT_IMPLEMENTED: AbortCode.UNSUPPORTED_ACCESS,
-    ErrorCode.BUSY: AbortCode.DEVICE_STATE,
-    ErrorCode.SEQUENCE: AbortCode.DEVICE_STATE,
-}
 
 
 @dataclass(frozen=True)
@@ -57,7 +48,8 @@ def check_status(status: int, what: str) -> None:
     """Raise `SdoAbortError` for a published error code other than 0."""
     if status != ErrorCode.OK:
         code = ErrorCode(status)
-        raise SdoAbortError(STATUS_ABORTS.get(code, AbortCode.GENERAL), f"{what}: {code.name.lower()}")
+        abort = ABORTS.get(code, (AbortCode.GENERAL,))[0]
+        raise SdoAbortError(abort, f"{what}: {code.name.lower()}")
 
 
 def abort_of(error: MessageError) -> SdoAbortError:

@@ -27,7 +27,8 @@ from starhil.protocol.canopen.pdo_mapping import Direction, resolve_all
 from starhil.protocol.canopen_schema import PackedField, PdoModel, PlacedMember, PlacedObject
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.values import IcdError, MessageError, Parameter, representable
+from starhil.protocol.errors import IcdError
+from starhil.protocol.values import MessageError, Parameter, representable
 
 LARGEST_SUBINDEX: Final = 254
 """Highest sub-index of a member (CiA 301: 255 is reserved)."""

@@ -7,27 +7,12 @@ from collections.abc import Generator, Sequence
 from contextlib import suppress
 from typing import Final
 
-from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.abort import SdoAbortError
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, Key, in_order, span_of
 from starhil.protocol.codec import Row, Slot
-from starhil.protocol.messages import ErrorCode
 
 SdoTransfer = Generator[bytes, bytes, bytes]
 """Returns the data of an upload, or no data after a download; raises `SdoAbortError` on an abort."""
-
-ERROR_OF_ABORT: Final[dict[int, ErrorCode]] = {
-    AbortCode.NO_OBJECT: ErrorCode.INVALID_ID,
-    AbortCode.NO_SUBINDEX: ErrorCode.INVALID_ID,
-    AbortCode.LENGTH: ErrorCode.INVALID_LENGTH,
-    AbortCode.LENGTH_HIGH: ErrorCode.INVALID_LENGTH,
-    AbortCode.LENGTH_LOW: ErrorCode.INVALID_LENGTH,
-    AbortCode.VALUE_RANGE: ErrorCode.INVALID_PARAMETER,
-    AbortCode.VALUE_HIGH: ErrorCode.INVALID_PARAMETER,
-    AbortCode.VALUE_LOW: ErrorCode.INVALID_PARAMETER,
-    AbortCode.UNSUPPORTED_ACCESS: ErrorCode.NOT_IMPLEMENTED,
-    AbortCode.DEVICE_STATE: ErrorCode.BUSY,
-}
-"""Abort code → published error code; all others are internal errors."""
 
 _ABORT: Final = 0x80
 _SEGMENT: Final = 7

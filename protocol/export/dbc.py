@@ -20,11 +20,12 @@ from starhil.protocol.can_framing import (
 )
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.errors import IcdError
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.export.templates import fill
 from starhil.protocol.messages import ErrorCode, ReplyKind
 from starhil.protocol.quoting import Scope, dbc_string
-from starhil.protocol.values import EnumDefinition, IcdError
+from starhil.protocol.values import EnumDefinition
 
 EXTENDED: Final = 0x80000000
 """Flag of a 29-bit CAN ID in DBC files."""

@@ -5,14 +5,14 @@ A packet begins with the key of its row: the row ID and, if the link carries a c
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Final
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.errors import IcdError
 from starhil.protocol.link_schema import CustomCheck, CustomFraming, FixedFraming, LengthFraming, MessageClass
 from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.values import IcdError
 
 CLASS_SHIFT: Final = 8
 """Position of the class code, in bits."""
@@ -37,12 +37,12 @@ def check_one_format(stack: SerialStack, target: str) -> None:
             raise IcdError(f"link.serial: {what} cannot be exported to {target}")
 
 
-def row_key(classes: Sequence[MessageClass], klass: str, row_id: int) -> int:
+def row_key(classes: Mapping[str, MessageClass], klass: str, row_id: int) -> int:
     """Return the key of a row.
 
     Raises IcdError for an ID that leaves no room for a class.
     """
-    code = next((item.code for item in classes if item.name == klass), None)
+    code = classes[klass].code if klass else None
     if code is None:
         return row_id
     if row_id >= 1 << CLASS_SHIFT:
@@ -54,7 +54,7 @@ def row_key(classes: Sequence[MessageClass], klass: str, row_id: int) -> int:
 
 def key_of(icd: InterfaceDefinition, row: Row) -> int:
     """Return the key of a row of a definition."""
-    return row_key(icd.classes, row.klass, row.id)
+    return row_key(icd.classes_by_name, row.klass, row.id)
 
 
 def key_bits(icd: InterfaceDefinition) -> int:

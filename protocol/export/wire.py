@@ -198,7 +198,7 @@ def _fixed_value(const: int | None, default: int | None) -> str:
 
 def _cubespace(icd: InterfaceDefinition, framing: CubeSpaceFraming) -> Section:
     texts = texts_of("cubespace")
-    rows = sorted(icd.telecommands_by_id.values(), key=lambda row: row.id)
+    rows = sorted(icd.telecommands.values(), key=lambda row: row.id)
     silent = " or ".join(
         f"`{row.name}` ({row.id})" for row in rows if not row.answers or row.name in framing.unanswered
     )

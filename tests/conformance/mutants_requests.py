@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 
 from starhil.emulator.device.device import Device
-from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request, RequestKind
 from tests.conformance.mutant_seams import (
     Damage,
     enter,
@@ -67,8 +67,8 @@ enter(
     "lengths.set_mode.long",
     handling(
         lambda d, r, h: (
-            h(dataclasses.replace(r, data=r.data[: d.icd.telecommands_by_id[r.id].size]))
-            if r.id in d.icd.telecommands_by_id
+            h(dataclasses.replace(r, data=r.data[: d.icd.row(r.id).size]))
+            if r.kind is RequestKind.TELECOMMAND and d.icd.row(r.id)
             else h(r)
         )
     ),
@@ -79,8 +79,8 @@ enter(
     "lengths.set_unix_time.short",
     handling(
         lambda d, r, h: (
-            h(dataclasses.replace(r, data=r.data.ljust(d.icd.telecommands_by_id[r.id].size, b"\0")))
-            if r.id in d.icd.telecommands_by_id
+            h(dataclasses.replace(r, data=r.data.ljust(d.icd.row(r.id).size, b"\0")))
+            if r.kind is RequestKind.TELECOMMAND and d.icd.row(r.id)
             else h(r)
         )
     ),
@@ -168,7 +168,7 @@ def _after(name: str, act: Callable[[Device, Request], None]) -> Damage:
 
     def change(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
         replies = handle(request)
-        row = device.icd.telecommands_by_id.get(request.id)
+        row = device.icd.row(request.id)
         if row is not None and row.name == name and replies and replies[0].kind is ReplyKind.ACK:
             act(device, request)
         return replies

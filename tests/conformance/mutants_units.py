@@ -67,7 +67,7 @@ def telemetry_data(change: Callable[[bytes, Row], bytes]) -> Damage:
     """Change the data of telemetry."""
 
     def changed(reply: Reply, device: Device) -> Reply:
-        row = device.icd.rows_by_key.get((reply.klass, reply.id or 0))
+        row = device.icd.row(reply.id or 0, reply.klass)
         if reply.kind is not ReplyKind.TELEMETRY or row is None or not reply.data:
             return reply
         return dataclasses.replace(reply, data=change(reply.data, row))
@@ -134,9 +134,9 @@ def any_address(unit: SimulatedUnit) -> None:
 def any_class(unit: SimulatedUnit) -> None:
     """Take an unknown class for that of telemetry."""
     stack = stack_of(unit)
-    names = stack.classes.requests
-    for code in range(256):
-        names.setdefault(code, "telemetry")
+    for form in stack.request_formats.all:
+        for code in range(256):
+            form.header._classes.setdefault(code, "telemetry")
 
 
 def times_out_never(unit: SimulatedUnit) -> None:
@@ -186,7 +186,7 @@ def subscription_deaf(
 
 
 def cut_to_size(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
-    row = device.icd.rows_by_key.get((request.klass, request.id))
+    row = device.icd.row(request.id, request.klass)
     size = row.size if row is not None and row.kind == "telecommand" else 0
     return handle(dataclasses.replace(request, data=request.data[:size].ljust(size, b"\0")))
 
@@ -438,6 +438,6 @@ def _as_replies(unit: SimulatedUnit) -> None:
 
 
 def _answers_all(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
-    if (request.klass, request.id) in device.icd.rows_by_key:
+    if device.icd.row(request.id, request.klass) is not None:
         return handle(request)
     return [Reply(ReplyKind.TELEMETRY, request.id, bytes(4), klass=request.klass)]

@@ -55,12 +55,12 @@ def rows_of(unit: str) -> tuple[list[Request], list[Reply]]:
 
 def examined(unit: str, events: Any) -> int:
     """Decode the data of each message as its row says; return how many messages there were."""
-    rows, count = load_unit(unit).rows_by_key, 0
+    icd, count = load_unit(unit), 0
     for event in events:
         if isinstance(event, LinkFault):
             continue
         count += 1
-        row = rows.get((event.klass, event.id or 0))
+        row = icd.row(event.id or 0, event.klass)
         if row is not None:
             try:
                 row.decode(event.data)

@@ -124,7 +124,7 @@ class FakeDevice:
             send(reply)
 
     def _replies(self, request: Request) -> list[Reply]:
-        row = ICD.row_by_id(request.id)
+        row = ICD.row(request.id)
         if row is None:
             return [Reply(ReplyKind.NACK, request.id, code=ErrorCode.INVALID_ID)]
         if row.name in self.refuse:

@@ -221,7 +221,7 @@ def test_only_the_response_of_its_node_continues_a_transfer_which_a_time_out_abo
     link, sent = CanopenHostLink(ICD, "virtual:x"), []
     link.send = lambda frame: sent.append((frame.id, frame.data.hex()))
     row = next(row for row in ICD.telemetry.values() if row.size == 1)
-    unknown = next(number for number in range(128, 256) if number not in ICD.telemetry_by_id)
+    unknown = next(number for number in range(128, 256) if ICD.row(number) is None)
     link.reset_receiver()
     assert sent == []
     with pytest.raises(BenchError, match=f"request {unknown} is not in the object dictionary"):

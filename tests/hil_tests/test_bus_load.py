@@ -33,7 +33,7 @@ def good(request: Request, _: int) -> list[Reply]:
     """Answer as a device does."""
     if request.kind is RequestKind.TELECOMMAND:
         return [Reply(ReplyKind.ACK, request.id, destination=HOST)]
-    row = ICD.telemetry_by_id[request.id]
+    row = ICD.row(request.id)
     return [Reply(ReplyKind.TELEMETRY, request.id, row.encode(), destination=HOST)]
 
 
@@ -51,7 +51,7 @@ def refusing(request: Request, _number: int) -> list[Reply]:
 
 
 def outside_limits(request: Request, _number: int) -> list[Reply]:
-    size = ICD.telemetry_by_id[request.id].size if request.kind is RequestKind.TELEMETRY else 0
+    size = ICD.row(request.id).size if request.kind is RequestKind.TELEMETRY else 0
     return [Reply(ReplyKind.TELEMETRY, request.id, b"\xfe" * size, destination=HOST)]
 
 

@@ -43,13 +43,13 @@ class Expected:
 def answer_to(identifier: int, data: bytes, source: int = 0) -> Expected:
     """Say what a request is answered by."""
     if identifier >= 128:
-        row = ICD.telemetry_by_id.get(identifier)
+        row = ICD.row(identifier)
         if row is None:
             return Expected(identifier, frozenset({1}), source=source)
         if data:
             return Expected(identifier, frozenset({2}), source=source)
         return Expected(identifier, size=row.size, source=source)
-    row = ICD.telecommands_by_id.get(identifier)
+    row = ICD.row(identifier)
     if row is None:
         return Expected(identifier, frozenset({1}), source=source)
     if len(data) == row.size + 1:
@@ -77,7 +77,7 @@ def crc8(data: bytes) -> int:
 
 def is_dangerous(identifier: int, data: bytes) -> bool:
     """Return whether a request might be accepted and change how the device answers."""
-    row = ICD.telecommands_by_id.get(identifier)
+    row = ICD.row(identifier)
     return row is not None and row.name in STATE_CHANGING and answer_to(identifier, data).codes >= OK_OR_STATE
 
 

@@ -39,8 +39,8 @@ def random_string(rng: random.Random) -> bytes:
         return rng.randbytes(rng.randrange(1, 40))
     if kind < 5:
         return bytes(rng.choices((0x1F, 0x7F, 0xFF, 0x00, 0x80, 0x02, 0x81), k=rng.randrange(1, 25)))
-    identifier = rng.choice((rng.randrange(256), *ICD.telecommands_by_id, *ICD.telemetry_by_id))
-    row = ICD.row_by_id(identifier)
+    identifier = rng.choice((rng.randrange(256), *(row.id for row in ICD.rows)))
+    row = ICD.row(identifier)
     size = (
         row.size
         if row is not None and row.kind == "telecommand" and rng.random() < 0.7
@@ -125,9 +125,9 @@ def random_frame(rng: random.Random) -> CanFrame:
     if kind < 4:
         frame = CanFrame(rng.randrange(1 << 29), data)
     else:
-        number = rng.choice((rng.randrange(256), *ICD.telecommands_by_id, *ICD.telemetry_by_id))
+        number = rng.choice((rng.randrange(256), *(row.id for row in ICD.rows)))
         message_type = rng.choice((1, 1, 1, 4, 4, 4, 7, rng.randrange(32)))
-        row = ICD.row_by_id(number)
+        row = ICD.row(number)
         if message_type == 4 and rng.random() < 0.8:
             data = b""
         elif row is not None and row.size <= 8 and rng.random() < 0.7:
@@ -141,7 +141,7 @@ def random_frame(rng: random.Random) -> CanFrame:
 def segmented(rng: random.Random) -> list[CanFrame]:
     """Make a telecommand of several segments, at times with one lost, doubled or out of order."""
     number = rng.choice([row.id for row in ICD.telecommands.values() if row.size > 8] + [rng.randrange(128)])
-    row = ICD.telecommands_by_id.get(number)
+    row = ICD.row(number)
     data = rng.randbytes(
         row.size if row is not None and row.size > 8 and rng.random() < 0.7 else rng.randrange(9, 40)
     )

@@ -71,6 +71,7 @@ def definition(
         Names("enum", ()), Names("parameter", ()), Names("parameter", ()),
         link=LinkModel(serial=SerialLinkModel.model_validate(link)), conventions=Conventions(byte_order=order),
         classes=classes, plugin=plugin or Plugin(),
+        first_telemetry_id=128 if link["framing"]["kind"] == "cubespace" else None,
     )  # fmt: skip
 
 

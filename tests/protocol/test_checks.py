@@ -8,8 +8,8 @@ import pytest
 from pydantic import TypeAdapter
 
 from starhil.protocol.checks import build_check
+from starhil.protocol.errors import IcdError
 from starhil.protocol.link_schema import CheckModel
-from starhil.protocol.values import IcdError
 
 DIGITS = b"123456789"
 ADAPTER: TypeAdapter[Any] = TypeAdapter(CheckModel)

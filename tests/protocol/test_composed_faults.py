@@ -65,7 +65,7 @@ def test_message_to_another_address_is_flagged_as_such() -> None:
                 {"role": "id", "type": "u8"},
             ],
         },
-        tuple(SAGITTA.classes.classes),
+        SAGITTA.icd.classes,
     )
     sent = other.encode_request(REQUESTS["sagitta"][2])
     assert faults(list(SAGITTA.device().feed(sent, 0.0))) == [FaultKind.UART_ADDRESS]

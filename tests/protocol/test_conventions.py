@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from starhil.protocol.errors import IcdError
 from starhil.protocol.export import export
 from starhil.protocol.icd import load_unit
 from starhil.protocol.unit_examples import examine
-from starhil.protocol.values import IcdError, Section
+from starhil.protocol.values import Section
 from starid.attitude import Attitude
 
 ICD = load_unit()

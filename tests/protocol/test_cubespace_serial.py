@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -12,7 +13,7 @@ from starhil.protocol.cubespace import BURST_SIZE, Dialect
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_stack import SerialStack
-from tests.protocol.composed_links import CUBESPACE, shape, stack_of
+from tests.protocol.composed_links import CUBESPACE, definition, shape, stack_of
 
 TC, TLM = RequestKind.TELECOMMAND, RequestKind.TELEMETRY
 GOOD = Request(TC, 2, b"\x1f\x00\xff\x7f\x1f\x1f")
@@ -34,6 +35,15 @@ def device_feed(text: str) -> list[Request | LinkFault]:
 
 def kinds(events: list[Request | LinkFault]) -> list[FaultKind | int]:
     return [event.kind if isinstance(event, LinkFault) else event.id for event in events]
+
+
+def test_the_kind_of_a_request_is_that_of_its_row() -> None:
+    link = {"framing": {"kind": "cubespace"}}
+    unit = definition(link, rows=(shape("", 5, TLM), shape("", 200, TC, 1)))
+    device = SerialStack(replace(unit, first_telemetry_id=None)).device()
+    found = device.feed(CUBESPACE.encode_request(Request(TLM, 5)), 0.0)
+    found += device.feed(CUBESPACE.encode_request(Request(TC, 200, b"\1")), 0.1)
+    assert found == [Request(TLM, 5), Request(TC, 200, b"\1")]
 
 
 # -- requests ----------------------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ def python_link(name: str) -> Any:
 
 
 def key_of(stack: SerialStack, message: Request | Reply) -> int:
-    return row_key(stack.classes.classes, message.klass, message.id or 0)
+    return row_key(stack.classes, message.klass, message.id or 0)
 
 
 def expected(stack: SerialStack, reply: Reply) -> tuple[str, int, bytes]:

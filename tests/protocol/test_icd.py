@@ -12,10 +12,17 @@ from hypothesis import strategies as st
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import UnknownNameError
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.names import find_unit
-from starhil.protocol.values import FieldError, IcdError, LengthError, MessageError, Value, to_f32
+from starhil.protocol.values import (
+    FieldError,
+    LengthError,
+    MessageError,
+    Value,
+    to_f32,
+)
 
 ICD = load_unit()
 ROWS = list(ICD.rows)
@@ -30,13 +37,13 @@ PUBLISHED_SIZES = {
 
 @pytest.mark.parametrize(("identifier", "size"), PUBLISHED_SIZES.items())
 def test_published_rows_have_their_published_sizes(identifier: int, size: int) -> None:
-    row = ICD.row_by_id(identifier)
+    row = ICD.row(identifier)
     assert row is not None
     assert row.size == size
 
 
 def test_the_escape_byte_is_not_an_id() -> None:
-    assert ICD.row_by_id(0x1F) is None
+    assert ICD.row(0x1F) is None
 
 
 def test_own_rows_are_marked_and_published_rows_name_their_source() -> None:
@@ -246,6 +253,7 @@ REFUSED: list[tuple[str, dict[str, Value], str]] = [
     ("set_unix_time", {"seconds": 1.5}, "not a whole number"),
     ("set_unix_time", {}, "set_unix_time.seconds: missing value"),
     ("set_mode", {"mode": "error"}, "not one of standby"),
+    ("set_mode", {"mode": "stanby"}, r"'stanby' is not one of standby \(1\).*; did you mean standby\?$"),
     ("set_mode", {"mode": 9}, "not one of standby"),
     ("set_mode", {"mood": "standby"}, "set_mode.mood: no such field"),
     ("set_update_rate", {"rate": 0.0}, "rate: 0.0 is outside 0.01 to 100 Hz"),

@@ -6,14 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.export.c import render_folder as c_files
 from starhil.protocol.export.cosmos_plugin import render_folder as cosmos_files
 from starhil.protocol.export.xtce import render as xtce
 from starhil.protocol.icd import load_unit, read_definition
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.values import IcdError
 from tests.protocol.composed_links import TC, TLM, faults, shape, stack_of
 
 ST200 = load_unit("st200")

@@ -2,8 +2,8 @@
 
 import pytest
 
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd import load_unit, read_definition
-from starhil.protocol.values import IcdError
 
 UNIT = '[unit]\nname = "u"\nversion = "1"\ndoc = "d"\n'
 

@@ -9,9 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.unit_examples import examine
-from starhil.protocol.values import IcdError
 
 HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "x"\n'
 ROW = '[[telemetry]]\nid = 1\nname = "row"\ndoc = "x"\nprovenance = "ours"\n'

@@ -71,7 +71,7 @@ def decode(icd: InterfaceDefinition, event: Request | Reply | LinkFault) -> bool
     """Decode the data of a message as its row says; return whether that is possible."""
     if isinstance(event, LinkFault):
         return False
-    row = icd.rows_by_key.get((event.klass, event.id or 0))
+    row = icd.row(event.id or 0, event.klass)
     if row is None:
         return False
     try:
@@ -89,7 +89,9 @@ def test_bytes_of_another_unit_are_flagged_and_survived(unit, other):
     for number, sent in enumerate(exchanges(load_unit(other), foreign)[0]):
         events = [*receiver.feed(sent, number), *receiver.flush(number + 0.9)]
         faults = [event for event in events if isinstance(event, LinkFault)]
-        known = [event for event in events if isinstance(event, Request) and stack.row(event.klass, event.id)]
+        known = [
+            event for event in events if isinstance(event, Request) and stack.icd.row(event.id, event.klass)
+        ]
         assert not known, (sent.hex(), events)  # any line may be the text of a request, but of no row
         assert faults == events or stack.text_formats, (sent.hex(), events)
         found += [event.kind for event in faults]

@@ -5,12 +5,13 @@ from pathlib import Path
 import pytest
 
 from starhil.protocol.device_model import device_model
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import SKELETON, bundled_units
 from starhil.protocol.plugin import quantity
 from starhil.protocol.unit_examples import examine, exchanges
 from starhil.protocol.units_of_measure import factor
-from starhil.protocol.values import FieldError, IcdError
+from starhil.protocol.values import FieldError
 
 HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "d"\n'
 BIG = HEAD + '[conventions]\nbyte_order = "big"\n'
@@ -104,7 +105,7 @@ def test_rows_of_two_classes_may_have_one_id(unit):
     icd = unit(
         HEAD + CLASSES + telemetry(a, "one", 5, 'class = "get"') + telemetry(b, "two", 5, 'class = "watch"')
     )
-    assert icd.rows_by_key["get", 5].name == "one"
+    assert icd.row(5, "get").name == "one"
     assert icd.telemetry_row(5).name == "one"
     assert icd.telemetry_row(5, "watch").name == "two"
     assert icd.request(icd.telemetry["two"]).klass == "watch"

@@ -8,6 +8,7 @@ from typing import Any, Final
 from starhil.protocol.checks import reversed_bits
 from starhil.protocol.conventions import Order
 from starhil.protocol.envelope import Header
+from starhil.protocol.errors import IcdError
 from starhil.protocol.export.packets import check_one_format, row_key
 from starhil.protocol.export.templates import fill, part_of, text_of
 from starhil.protocol.link_schema import (
@@ -22,7 +23,6 @@ from starhil.protocol.link_schema import (
     XxHashCheck,
 )
 from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.values import IcdError
 
 _MARKS: Final = 8
 """Maximum size of the start and end marks of a message, in bytes, apart from those in a definition."""
@@ -35,7 +35,7 @@ def link_parts(stack: SerialStack) -> tuple[str, str, str]:
     """
     check_one_format(stack, "C")
     framing = "counted" if stack.link.framing.kind in ("length", "fixed") else stack.link.framing.kind
-    header = max(stack.requests.header.size(name) for name in ("", *stack.classes.by_name))
+    header = max(stack.requests.header.size(name) for name in ("", *stack.classes))
     marks = len(stack.requests.framing.start) + len(stack.requests.framing.end) + _MARKS
     sizes = {
         "MAX_MESSAGE": stack.max_size,
@@ -100,7 +100,7 @@ def _constants(stack: SerialStack) -> dict[str, str]:
 
 def _rows(stack: SerialStack) -> dict[str, Any]:
     """Return the functions of a row's key: tests of its kind, and its sizes."""
-    rows = {row_key(stack.classes.classes, row.klass, row.id): row for row in stack.rows}
+    rows = {row_key(stack.classes, row.klass, row.id): row for row in stack.rows}
     headers = {key: stack.requests.header.size(row.klass) for key, row in rows.items()}
     requests = {key: headers[key] + row.request_size + stack.requests.check.size for key, row in rows.items()}
     return {
@@ -119,7 +119,7 @@ def _rows(stack: SerialStack) -> dict[str, Any]:
 
 
 def _headers(stack: SerialStack) -> dict[str, Any]:
-    classes = stack.classes.by_name
+    classes = stack.classes
     coded = "class" in stack.requests.header.roles
 
     def role(name: str | None, default: int, mask: int = -1) -> str:

@@ -66,7 +66,7 @@ def _check(stack: SerialStack) -> dict[str, Any]:
 
 
 def _headers(stack: SerialStack) -> dict[str, Any]:
-    classes = stack.classes.classes
+    classes = stack.icd.classes
     codes = {item.name: item.code or 0 for item in classes}
     coded = [item for item in classes if item.code is not None]
     reply = {item.reply_code: item.code for item in coded}
@@ -102,7 +102,7 @@ def _fields(header: Header, codes: Mapping[str, int]) -> Iterator[dict[str, Any]
 def _rows(stack: SerialStack) -> Iterator[tuple[int, dict[str, Any]]]:
     for row in stack.rows:
         yield (
-            row_key(stack.classes.classes, row.klass, row.id),
+            row_key(stack.classes, row.klass, row.id),
             {
                 "telemetry": row.kind == "telemetry",
                 "request_size": row.request_size,

@@ -278,7 +278,7 @@ def test_ten_thousand_random_strings_do_no_harm(bench):
             nonlocal counted
             counted += 1
             replies = handle(request, **options)
-            row = bench.icd.row_by_id(request.id)
+            row = bench.icd.row(request.id)
             if row is None:
                 assert replies[0].code is ErrorCode.INVALID_ID
             elif len(request.data) != (0 if request.id >= 128 else row.size):

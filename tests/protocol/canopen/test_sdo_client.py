@@ -9,8 +9,8 @@ from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import download, requests_of, row_transfer
 from starhil.protocol.canopen.slave import CanopenSlave
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.values import IcdError
 from tests.protocol.canopen.stand_in import StandInApplication
 
 NODE = 0x2C

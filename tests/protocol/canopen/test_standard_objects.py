@@ -11,8 +11,8 @@ from starhil.protocol.canopen.abort import AbortCode
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.canopen_schema import CanopenModel
+from starhil.protocol.errors import IcdError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.values import IcdError
 
 EMCY = 0xAC
 
