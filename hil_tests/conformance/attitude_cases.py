@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, Protocol, Self
+from typing import Final, Self
 
 from starhil.hil_tests.attitude import Quaternion, as_reported, conjugate, from_reported, to_radec_roll
 from starhil.hil_tests.conformance.attitude_forms import (
@@ -20,7 +20,7 @@ from starhil.hil_tests.conformance.attitude_forms import (
     axes_of,
     readings,
 )
-from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check
+from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, Probe, check
 from starhil.hil_tests.judge.messages import Value
 from starhil.hil_tests.judge.rows import Field, Row
 
@@ -33,36 +33,6 @@ MODE_S: Final = 5.0
 SEARCHING: Final = "lost_in_space"
 TRACKING: Final = "tracking"
 STANDBY: Final = "standby"
-
-TruthSource = Callable[[], Quaternion]
-"""Returns the true attitude from ICRS to the sensor at present."""
-
-
-class RowAccess(Protocol):
-    """Rows of a unit on some link."""
-
-    truth: TruthSource | None
-
-    def telecommands(self) -> Iterable[Row]:
-        """Return the telecommands that the link carries."""
-
-    def telemetry_rows(self) -> Iterable[Row]:
-        """Return the telemetry that the link carries."""
-
-    def carries(self, row: Row, item: Field) -> bool:
-        """Return whether the link carries a field of a row."""
-
-    def values(self, row: Row) -> dict[str, Value]:
-        """Read the values of a row; one outside its limits fails the case."""
-
-    def command(self, name: str, **values: Value) -> None:
-        """Send a telecommand by name, which must be accepted."""
-
-    def now(self) -> float:
-        """Time, s."""
-
-    def sleep(self, seconds: float) -> None:
-        """Wait."""
 
 
 @dataclass(frozen=True)
@@ -96,44 +66,44 @@ class AttitudeRow:
     def _is_stated(self, seen: Mapping[str, Value]) -> bool:
         return any(seen[item.name] for reading in self.readings for item in reading.fields)
 
-    def becomes_valid(self, access: RowAccess) -> None:
+    def becomes_valid(self, probe: Probe) -> None:
         """Have the unit identify stars, and check the first attitude that is valid; before, in standby, none is."""
-        rest, search = mode_command(access, STANDBY), mode_command(access, SEARCHING)
-        with identifying_stars(access):
+        rest, search = mode_command(probe, STANDBY), mode_command(probe, SEARCHING)
+        with identifying_stars(probe):
             if rest is not None and search is not None:
                 rest()
-                seen = access.values(self.row)
+                seen = probe.values(self.row)
                 check(
                     not self.is_valid(seen),
                     "no valid attitude in standby (R11, docs/rules.md)",
                     "a valid one",
                 )
-                check_mode(access, STANDBY)
+                check_mode(probe, STANDBY)
                 search()
             if search is not None:
-                check_mode(access, SEARCHING, TRACKING)
-            end = access.now() + ATTITUDE_S
-            while not self.is_valid(seen := access.values(self.row)):
-                if access.now() > end:
-                    self._check_flag(access, seen)
+                check_mode(probe, SEARCHING, TRACKING)
+            end = probe.now() + ATTITUDE_S
+            while not self.is_valid(seen := probe.values(self.row)):
+                if probe.now() > end:
+                    self._check_flag(probe, seen)
                     raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
-                access.sleep(0.1)
-            self.check(access, seen)
-            self._check_truth(access)
+                probe.sleep(0.1)
+            self.check(probe, seen)
+            self._check_truth(probe)
 
-    def check(self, access: RowAccess, seen: Mapping[str, Value]) -> None:
+    def check(self, probe: Probe, seen: Mapping[str, Value]) -> None:
         """Fail the case if an attitude is valid in standby, of a wrong length, not the truth, or not that of other fields."""
         if not self.is_valid(seen):
             return
-        if in_standby(access):
-            still = self.is_valid(access.values(self.row)) and in_standby(access)
+        if in_standby(probe):
+            still = self.is_valid(probe.values(self.row)) and in_standby(probe)
             check(not still, "no valid attitude in standby (R11, docs/rules.md)", "a valid one")
-        self._check_attitudes(access, seen)
+        self._check_attitudes(probe, seen)
 
-    def _check_attitudes(self, access: RowAccess, seen: Mapping[str, Value]) -> None:
+    def _check_attitudes(self, probe: Probe, seen: Mapping[str, Value]) -> None:
         """Compare the first attitude with the truth, and the others with both."""
         known: list[tuple[str, Axes, float]] = []
-        truth = None if access.truth is None else access.truth()
+        truth = None if probe.truth is None else probe.truth()
         for reading in self.readings:
             axes = reading.axes(seen, self.conventions)
             true = [] if truth is None else [(self._stated(truth, reading), axes_of(truth), 0.0)]
@@ -153,77 +123,77 @@ class AttitudeRow:
         ra, dec, roll = (round(angle, 3) for angle in to_radec_roll(truth))
         return f"the true attitude RA {ra} deg, Dec {dec} deg, roll {roll} deg"
 
-    def _check_truth(self, access: RowAccess) -> None:
+    def _check_truth(self, probe: Probe) -> None:
         """Skip the case, which has passed, if the conjugate of the true attitude would have passed as well."""
         limits = [TRUTH_DEG + item.rounding_deg for item in self.readings if item.form.has_inverse]
-        if access.truth is None or not limits:
+        if probe.truth is None or not limits:
             return
-        truth = access.truth()
+        truth = probe.truth()
         turned = from_reported(conjugate(as_reported(truth, self.conventions)), self.conventions)
         error_deg = angle_deg(axes_of(turned), axes_of(truth))
         if error_deg <= max(limits):
             reason = f"a conjugated attitude would pass too: at this truth it is only {error_deg:.2f} deg off"
             raise CaseSkipped(f"{reason}; point the unit elsewhere")
 
-    def _check_flag(self, access: RowAccess, seen: Mapping[str, Value]) -> None:
+    def _check_flag(self, probe: Probe, seen: Mapping[str, Value]) -> None:
         """Fail the case if the true attitude is reported, but never as valid."""
-        if self.flag is None or access.truth is None or not self._is_stated(seen):
+        if self.flag is None or probe.truth is None or not self._is_stated(seen):
             return
         try:
-            self._check_attitudes(access, seen)
+            self._check_attitudes(probe, seen)
         except CaseFailed:
             return
         wanted = f"{self.flag} set within {ATTITUDE_S:g} s, because the reported attitude is the true one"
         raise CaseFailed(wanted, f"{self.flag} = {seen[self.flag]!r}")
 
 
-def _mode_fields(access: RowAccess) -> Iterator[tuple[Row, Field]]:
-    for row in access.telemetry_rows():
+def _mode_fields(probe: Probe) -> Iterator[tuple[Row, Field]]:
+    for row in probe.telemetry_rows():
         yield from (
-            (row, item) for item in row.named.values() if item.value == "mode" and access.carries(row, item)
+            (row, item) for item in row.named.values() if item.value == "mode" and probe.carries(row, item)
         )
 
 
-def reported_mode(access: RowAccess) -> Value | None:
+def reported_mode(probe: Probe) -> Value | None:
     """Return the mode that a row reports, the first of several with one number; None if no row does."""
-    row, item = next(_mode_fields(access), (None, None))
-    return None if row is None or item is None else access.values(row)[item.name]
+    row, item = next(_mode_fields(probe), (None, None))
+    return None if row is None or item is None else probe.values(row)[item.name]
 
 
-def in_standby(access: RowAccess) -> bool:
+def in_standby(probe: Probe) -> bool:
     """Return whether a row reports standby, by a number that stands for no other mode."""
-    for row, item in _mode_fields(access):
+    for row, item in _mode_fields(probe):
         if STANDBY not in item.shared:
-            return access.values(row)[item.name] == STANDBY
+            return probe.values(row)[item.name] == STANDBY
     return False
 
 
-def check_mode(access: RowAccess, commanded: str, *entered: str) -> None:
+def check_mode(probe: Probe, commanded: str, *entered: str) -> None:
     """Fail the case unless rows report in time the mode commanded, or one since entered by itself (R13).
 
     A field that has no number for the commanded mode, or another mode's, is left out.
     """
     wanted = (commanded, *entered)
-    for row, item in _mode_fields(access):
+    for row, item in _mode_fields(probe):
         if commanded not in (item.enum or {}):
             continue
-        end = access.now() + MODE_S
-        while (seen := access.values(row)[item.name]) not in wanted:
+        end = probe.now() + MODE_S
+        while (seen := probe.values(row)[item.name]) not in wanted:
             within = f"within {MODE_S:g} s of the telecommand (R13, docs/rules.md)"
-            check(access.now() < end, f"{item.name} of {row.name} {' or '.join(wanted)} {within}", seen)
-            access.sleep(0.1)
+            check(probe.now() < end, f"{item.name} of {row.name} {' or '.join(wanted)} {within}", seen)
+            probe.sleep(0.1)
 
 
-def mode_command(access: RowAccess, mode: Value | None) -> Callable[[], None] | None:
+def mode_command(probe: Probe, mode: Value | None) -> Callable[[], None] | None:
     """Return what commands a mode; None if no telecommand does, or the mode is unknown."""
-    for row in access.telecommands():
+    for row in probe.telecommands():
         if row.action != "set_mode" or mode is None:
             continue
         field = next((name for name, item in row.named.items() if item.argument == "mode"), None)
         if field is not None and mode in (row.named[field].enum or {}):
-            return partial(access.command, row.name, **{field: mode})
+            return partial(probe.command, row.name, **{field: mode})
         if field is None and row.arguments.get("mode") == mode:
-            return partial(access.command, row.name)
+            return partial(probe.command, row.name)
     return None
 
 
@@ -233,14 +203,14 @@ def changes_mode(telecommands: Iterable[Row]) -> bool:
 
 
 @contextmanager
-def identifying_stars(access: RowAccess) -> Iterator[None]:
+def identifying_stars(probe: Probe) -> Iterator[None]:
     """Have the unit identify stars, if a telecommand starts this; restore the mode that it reports afterwards."""
-    start = mode_command(access, SEARCHING)
+    start = mode_command(probe, SEARCHING)
     if start is None:
         yield
         return
-    before = reported_mode(access)
-    restore = mode_command(access, SEARCHING if before == TRACKING else before)
+    before = reported_mode(probe)
+    restore = mode_command(probe, SEARCHING if before == TRACKING else before)
     start()
     try:
         yield

@@ -74,7 +74,6 @@ from starhil.hil_tests.conformance.canopen_probe import (
     LSS_FROM_SLAVE,
     LSS_TO_SLAVE,
     NO_RTR,
-    NOBODY,
     PDO_OFF,
     RESET_COMMUNICATION,
     RESET_NODE,
@@ -410,11 +409,11 @@ class _Master:
 
     def nmt(self, command: Number, whom: str = "") -> None:
         node = {"all": 0, "other": self._probe.node % 127 + 1}.get(whom)
-        self._probe.command(command, node)
+        self._probe.nmt(command, node)
 
     def reset(self, whom: str = "") -> None:
         self._probe.drain()
-        self._probe.command(RESET_NODE if whom == "node" else RESET_COMMUNICATION)
+        self._probe.nmt(RESET_NODE if whom == "node" else RESET_COMMUNICATION)
         self._probe.expect_boot_up()
 
     def boot_up(self) -> None:
@@ -485,13 +484,13 @@ class _Master:
         self._probe.quiet()
 
     def sleep(self, seconds: float) -> None:
-        self._probe.wait_for(NOBODY, seconds)
+        self._probe.sleep(seconds)
 
     def clock(self) -> None:
-        self._began = self._probe.port.now()
+        self._began = self._probe.now()
 
     def took(self, least: float, most: float) -> None:
-        seconds = self._probe.port.now() - self._began
+        seconds = self._probe.now() - self._began
         check(least <= seconds <= most, f"after {least:g} to {most:g} s", f"{seconds:.3f} s")
 
     # EMCY

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from binascii import crc_hqx
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 from enum import IntEnum
 from typing import Any, Final, TypeVar
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
-from starhil.hil_tests.conformance.attitude_cases import TruthSource
-from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check, check_equal
+from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, Probe, check, check_equal
+from starhil.hil_tests.conformance.link_probe import checked_values
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge.canopen import (
     ABORT,
@@ -27,9 +27,14 @@ from starhil.hil_tests.judge.canopen import (
     Entry,
     abort_code,
     download,
+    row_data,
+    slots,
     upload,
     upload_request,
+    written,
 )
+from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.rows import Field, Row
 
 T = TypeVar("T")
 
@@ -50,8 +55,6 @@ BOOT_S: Final = 3.0
 """Maximum time from a communication reset to the boot-up message."""
 FIRST_OWN_OBJECT: Final = 0x2000
 
-NOBODY: Final = -1
-"""No CAN ID; waiting for it lets time pass."""
 SETTLING_S: Final = 0.05
 """Time in which a node obeys an NMT command and frames in transit arrive."""
 
@@ -98,21 +101,27 @@ WATCHED_NODE: Final = 0x05
 """Node ID of a simulated watched node; no other node on the bus may have it."""
 
 
-class CanopenProbe:
+class CanopenProbe(Probe):
     """Talks to one node.
 
-    `od` is the object dictionary of the EDS, whose text is `eds`; empty if there is none.
+    `od` is the object dictionary of the EDS, whose text is `eds`; empty if there is none. `entries` are those of the unit's definition.
     """
 
     link = "canopen"
 
-    def __init__(self, port: Port[CanFrame], node: int, od: ObjectDictionary, eds: str = "") -> None:
-        self.port = port
+    def __init__(
+        self,
+        port: Port[CanFrame],
+        node: int,
+        od: ObjectDictionary,
+        eds: str = "",
+        entries: Iterable[Entry] = (),
+    ) -> None:
+        super().__init__(port)
         self.node = node
         self.od = od
         self.eds = eds
-        self.log: list[str] = []
-        self.truth: TruthSource | None = None
+        self.entries = list(entries)
         self._boots = True
         self._multiplexer = bytes(3)
         self._found: dict[tuple[int, int], bytes] = {}
@@ -136,7 +145,7 @@ class CanopenProbe:
         """
         if booting:
             self.drain()
-            self.command(RESET_COMMUNICATION)
+            self.nmt(RESET_COMMUNICATION)
         mine = {base + self.node for base in (EMERGENCY, SDO_RESPONSE, HEARTBEAT)}
         for _ in range(3):
             self.send_request(upload_request(0x1000, 0))
@@ -189,20 +198,24 @@ class CanopenProbe:
 
     # Frames
 
+    def sleep(self, seconds: float) -> None:
+        """Wait; frames received are discarded."""
+        self.wait_for((), seconds)
+
     def send(
         self, can_id: int, data: bytes | str = b"", *, remote: bool = False, extended: bool = False
     ) -> None:
         """Send a frame; text is hexadecimal."""
         payload = bytes.fromhex(data) if isinstance(data, str) else data
         frame = CanFrame(can_id, payload, extended=extended, remote=remote)
-        self.log.append(f"{self.port.now():.4f} -> {frame!s}")
+        self.log.append(f"{self.now():.4f} -> {frame!s}")
         self.port.send(frame)
 
     def receive(self, timeout_s: float) -> CanFrame | None:
         """Return the next frame, or None if none arrives in time."""
         frame = self.port.receive(timeout_s)
         if frame is not None:
-            self.log.append(f"{self.port.now():.4f} <- {frame!s}")
+            self.log.append(f"{self.now():.4f} <- {frame!s}")
         return frame
 
     def drain(self) -> None:
@@ -220,8 +233,8 @@ class CanopenProbe:
     ) -> bytes | None:
         """Return the data of the next accepted frame with one of the CAN IDs, or None."""
         wanted = {can_ids} if isinstance(can_ids, int) else can_ids
-        end = self.port.now() + (ANSWER_S if timeout_s is None else timeout_s)
-        while (left := end - self.port.now()) >= 0:
+        end = self.now() + (ANSWER_S if timeout_s is None else timeout_s)
+        while (left := end - self.now()) >= 0:
             frame = self.receive(left)
             if frame is None:
                 return None
@@ -250,12 +263,12 @@ class CanopenProbe:
 
     def count(self, can_id: int, for_s: float) -> list[tuple[float, bytes]]:
         """Return time and data of the frames with a CAN ID within a time."""
-        end, found = self.port.now() + for_s, []
-        while (left := end - self.port.now()) > 0:
+        end, found = self.now() + for_s, []
+        while (left := end - self.now()) > 0:
             data = self.wait_for(can_id, left)
             if data is None:
                 break
-            found.append((self.port.now(), data))
+            found.append((self.now(), data))
         return found
 
     # SDO
@@ -362,13 +375,13 @@ class CanopenProbe:
 
     # States
 
-    def command(self, specifier: int, node: int | None = None) -> None:
+    def nmt(self, specifier: int, node: int | None = None) -> None:
         """Send an NMT command."""
         self.send(NMT, bytes([specifier, self.node if node is None else node]))
 
     def state(self) -> int:
         """Return the state in the next heartbeat, after frames in transit have arrived."""
-        self.wait_for(NOBODY, SETTLING_S)
+        self.sleep(SETTLING_S)
         self.drain()
         return self.expect(HEARTBEAT + self.node, "heartbeat", 1.0)[0]
 
@@ -382,10 +395,10 @@ class CanopenProbe:
         A missing boot-up message is ignored, because most cases do not test it.
         """
         self.abandon_transfer()
-        self.command(RESET_COMMUNICATION)
+        self.nmt(RESET_COMMUNICATION)
         if self.wait_for(HEARTBEAT + self.node, 3.0 if self._boots else 0.1, _is_boot_up) is None:
             self._boots = False
-            self.command(PRE_OPERATIONAL)
+            self.nmt(PRE_OPERATIONAL)
         self.drain()
 
     def expect_boot_up(self) -> None:
@@ -407,6 +420,45 @@ class CanopenProbe:
         """Read the CAN ID of EMCY; skip the case if the node has none."""
         self.require("1014")
         return self.number(0x1014) & 0x7FF
+
+    # Rows, read and written by the entries that hold them
+
+    def telecommands(self) -> Iterable[Row]:
+        """Return the telecommands that an entry executes."""
+        return [entry.command for entry in self.entries if entry.command is not None and entry.part is None]
+
+    def telemetry_rows(self) -> Iterable[Row]:
+        """Return the rows that entries read."""
+        return {entry.row.name: entry.row for entry in self.entries if entry.row is not None}.values()
+
+    def carries(self, row: Row, item: Field) -> bool:
+        """Return whether an entry reads a field of a row."""
+        return any(slot.offset == item.offset for _, slot in slots(row, self.entries))
+
+    def values(self, row: Row) -> dict[str, Value]:
+        """Read the values of a row; one outside its limits fails the case.
+
+        The entries are read repeatedly, until no new sample has come in between.
+        """
+        seen = [b"", bytes(row.size)]
+        for _ in range(10):
+            seen.append(row_data(row, self.entries, self._part))
+            if seen[-1] == seen[-2]:
+                break
+        return checked_values(row, seen[-1])
+
+    def _part(self, entry: Entry) -> bytes:
+        data = self.value(entry)
+        if entry.size:
+            check_equal(len(data), entry.size, f"bytes of {entry.name}h")
+        return data
+
+    def command(self, name: str, **values: Value) -> None:
+        """Write an entry that executes a telecommand, which must be accepted."""
+        whole = [entry for entry in self.entries if entry.part is None]
+        found = {entry.command.name: (entry, entry.command) for entry in whole if entry.command is not None}
+        entry, command = found[name]
+        self.put(entry, written(entry, command, command.encode(values)))
 
     # Content of the dictionary
 

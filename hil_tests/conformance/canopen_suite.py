@@ -32,7 +32,7 @@ def attitude(probe: CanopenProbe) -> None:
             probe.set(index, 1, NO_RTR | can_id)
             chosen.append(can_id)
     check(len(chosen) >= 2, "two TPDOs that begin with the sequence number", len(chosen))
-    probe.command(START)
+    probe.nmt(START)
     for _ in range(5):
         probe.drain()
         probe.send(SYNC)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Final
 
@@ -14,7 +14,6 @@ from starhil.hil_tests.conformance.attitude_cases import (
 )
 from starhil.hil_tests.conformance.canopen_probe import (
     NO_RTR,
-    NOBODY,
     PDO_OFF,
     PRE_OPERATIONAL,
     START,
@@ -22,7 +21,6 @@ from starhil.hil_tests.conformance.canopen_probe import (
     CanopenProbe,
 )
 from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal
-from starhil.hil_tests.conformance.link_probe import checked_values
 from starhil.hil_tests.conformance.row_cases import CLOCK_S
 from starhil.hil_tests.judge.canopen import (
     EXPEDITED,
@@ -31,7 +29,7 @@ from starhil.hil_tests.judge.canopen import (
     entries,
     is_text,
     pdo_can_id,
-    row_data,
+    slots,
     written,
 )
 from starhil.hil_tests.judge.definition import Unit
@@ -62,72 +60,6 @@ def _case(
     return case_in(area, name, title, run, clause, intrusive=not safe)
 
 
-# --- reading and writing ---
-
-
-class EntryAccess:
-    """The rows that entries of the object dictionary hold."""
-
-    def __init__(self, probe: CanopenProbe, found: list[Entry]) -> None:
-        self.truth = probe.truth
-        self._probe, self._found = probe, found
-
-    def telecommands(self) -> Iterable[Row]:
-        """Return the telecommands that an entry executes."""
-        return [entry.command for entry in self._found if entry.command is not None and entry.part is None]
-
-    def telemetry_rows(self) -> Iterable[Row]:
-        """Return the rows that entries read."""
-        return {entry.row.name: entry.row for entry in self._found if entry.row is not None}.values()
-
-    def carries(self, row: Row, item: Field) -> bool:
-        """Return whether an entry reads a field of a row."""
-        return _carries(self._found, row, item)
-
-    def values(self, row: Row) -> dict[str, Value]:
-        """Read the values of a row; one outside its limits fails the case.
-
-        The entries are read repeatedly, until no new sample has come in between.
-        """
-        seen = [b"", bytes(row.size)]
-        for _ in range(10):
-            seen.append(row_data(row, self._found, self._read))
-            if seen[-1] == seen[-2]:
-                break
-        return checked_values(row, seen[-1])
-
-    def _read(self, entry: Entry) -> bytes:
-        data = self._probe.value(entry)
-        if entry.size:
-            check_equal(len(data), entry.size, f"bytes of {entry.name}h")
-        return data
-
-    def command(self, name: str, **values: Value) -> None:
-        """Write an entry that executes a telecommand, which must be accepted."""
-        entry = next(item for item in self._found if item.command is not None and item.command.name == name)
-        if entry.command is not None:
-            _write(entry, entry.command, values, self._probe)
-
-    def now(self) -> float:
-        """Time of the port, s."""
-        return self._probe.port.now()
-
-    def sleep(self, seconds: float) -> None:
-        """Wait."""
-        self._probe.wait_for(NOBODY, seconds)
-
-
-def _carries(found: list[Entry], row: Row, item: Field) -> bool:
-    return item.offset in {
-        entry.slot.offset for entry in found if entry.row is row and entry.slot is not None
-    }
-
-
-def _write(entry: Entry, command: Row, values: dict[str, Value], probe: CanopenProbe) -> None:
-    """Write an entry that executes a telecommand, which must be accepted."""
-    probe.put(entry, written(entry, command, command.encode(values)))
-
-
 def _argument(entry: Entry, name: str) -> Field | None:
     fields = entry.command.named.values() if entry.command is not None else ()
     return next((field for field in fields if field.argument == name), None)
@@ -140,24 +72,23 @@ def _rows(unit: Unit, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     for row in unit.telemetry.values():
         if not any(entry.row is row for entry in found):
             continue
-        fields = [item for item in row.named.values() if _carries(found, row, item)]
+        read = {slot.offset for _, slot in slots(row, found)}
+        fields = [item for item in row.named.values() if item.offset in read]
         attitude = AttitudeRow.of(row, unit.conventions, fields)
         title = f"the entries of {row.name} have the right sizes, and values within the limits"
-        yield _case("rows", row.name, title, partial(_values, row, attitude, found), row, safe=True)
+        yield _case("rows", row.name, title, partial(_values, row, attitude), row, safe=True)
         if attitude is not None:
-            run = partial(_becomes_valid, attitude, found)
-            yield _case("attitude", row.name, attitude.title, run, row)
+            yield _case("attitude", row.name, attitude.title, attitude.becomes_valid, row)
 
 
-def _values(row: Row, attitude: AttitudeRow | None, found: list[Entry], probe: CanopenProbe) -> None:
-    access = EntryAccess(probe, found)
-    seen = access.values(row)
+def _values(row: Row, attitude: AttitudeRow | None, probe: CanopenProbe) -> None:
+    seen = probe.values(row)
     if attitude is not None:
-        attitude.check(access, seen)
+        attitude.check(probe, seen)
 
 
-def _becomes_valid(attitude: AttitudeRow, found: list[Entry], probe: CanopenProbe) -> None:
-    attitude.becomes_valid(EntryAccess(probe, found))
+def _accepted(command: Row, probe: CanopenProbe) -> None:
+    probe.command(command.name, **command.example())
 
 
 # --- telecommands ---
@@ -170,26 +101,26 @@ def _commands(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             continue
         if command.action == "reset":
             title = f"{command.name} restarts the node"
-            run = partial(_restarts, entry, command, found)
+            run = partial(_restarts, command)
         elif entry.row is not None and entry.slot is not None:
             title = f"{entry.name}h reports each written value of {command.name}"
             run = partial(_reported, entry, command)
         elif command.action in (None, "nothing"):
-            title, run = f"{command.name} is accepted", partial(_write, entry, command, command.example())
+            title, run = f"{command.name} is accepted", partial(_accepted, command)
         else:
             continue
         yield _case("commands", command.name, title, run, command)
 
 
-def _restarts(entry: Entry, command: Row, found: list[Entry], probe: CanopenProbe) -> None:
+def _restarts(command: Row, probe: CanopenProbe) -> None:
     """Restart the unit, and wait until the mode reported by an entry is no longer the boot mode."""
     probe.drain()
-    _write(entry, command, command.example(), probe)
+    _accepted(command, probe)
     probe.expect_boot_up()
-    end = probe.port.now() + BOOT_S
-    while reported_mode(EntryAccess(probe, found)) == "boot":
-        check(probe.port.now() < end, f"the end of booting within {BOOT_S:g} s", "boot")
-        probe.wait_for(NOBODY, 0.1)
+    end = probe.now() + BOOT_S
+    while reported_mode(probe) == "boot":
+        check(probe.now() < end, f"the end of booting within {BOOT_S:g} s", "boot")
+        probe.sleep(0.1)
 
 
 def _fields(entry: Entry) -> list[Field]:
@@ -297,9 +228,7 @@ def _pdos(layout: Any, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
                 and any(_reports(entry, *CHANGING) and not _fields(entry)[0].width for entry in mapped)
             ):
                 title = f"{label} is sent when frames are taken"
-                yield _case(
-                    kind, f"{number + 1}.frames", title, partial(_sent_with_frames, index, model, found)
-                )
+                yield _case(kind, f"{number + 1}.frames", title, partial(_sent_with_frames, index, model))
             if first == 0x1400 and model.enabled:
                 yield from _clock(index, model, mapped, found)
 
@@ -323,7 +252,7 @@ def _carries_values(index: int, mapped: list[Entry], probe: CanopenProbe) -> Non
     can_id = probe.number(index, 1) & 0x7FF or UNUSED_ID
     probe.set(index, 2, 1, 1)
     probe.set(index, 1, NO_RTR | can_id)
-    probe.command(START)
+    probe.nmt(START)
 
     def read() -> bytes:
         return b"".join(probe.value(entry) for entry in mapped)
@@ -338,12 +267,12 @@ def _carries_values(index: int, mapped: list[Entry], probe: CanopenProbe) -> Non
     check_equal(data, after, "data")
 
 
-def _sent_with_frames(index: int, model: Any, found: list[Entry], probe: CanopenProbe) -> None:
-    with identifying_stars(EntryAccess(probe, found)):
-        probe.command(START)
+def _sent_with_frames(index: int, model: Any, probe: CanopenProbe) -> None:
+    with identifying_stars(probe):
+        probe.nmt(START)
         can_id = pdo_can_id(probe.node, index, model)
         times = [probe.expect(can_id, "TPDO of a frame", ATTITUDE_S) for _ in range(3)]
-    probe.command(PRE_OPERATIONAL)
+    probe.nmt(PRE_OPERATIONAL)
     check_equal(len(times), 3, "TPDOs")
 
 
@@ -372,11 +301,11 @@ def _clock(index: int, model: Any, mapped: list[Entry], found: list[Entry]) -> I
                 pdo_can_id(probe.node, index, model), command.encode({**command.example(), name: value})
             )
 
-        before, began = read(), probe.port.now()
-        probe.command(START)
+        before, began = read(), probe.now()
+        probe.nmt(START)
         send(CLOCK_S)
         seen = read()
-        send(before + round(probe.port.now() - began))
+        send(before + round(probe.now() - began))
         check(0 <= seen - CLOCK_S <= 1, f"a time just after {CLOCK_S} s", seen)
 
     title = f"RPDO {(index & 0x1FF) + 1} ({model.name}) sets the clock"

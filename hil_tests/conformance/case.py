@@ -1,15 +1,22 @@
-"""A conformance case: what it checks, its source, and its function."""
+"""A conformance case: what it checks, its source, and its function; and the probe that the function gets."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
-from starhil.hil_tests.judge.rows import Row
+from starhil.hil_tests.attitude import Quaternion
+from starhil.hil_tests.conformance.ports import Port
+from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.rows import Field, Row
 
 ProbeType = TypeVar("ProbeType")
+
+TruthSource = Callable[[], Quaternion]
+"""Returns the true attitude from ICRS to the sensor at present."""
 
 
 class CaseFailed(Exception):  # noqa: N818 (the outcome of a case, not an error of the bench)
@@ -23,6 +30,83 @@ class CaseFailed(Exception):  # noqa: N818 (the outcome of a case, not an error 
 
 class CaseSkipped(Exception):  # noqa: N818 (the outcome of a case, not an error of the bench)
     """The device lacks a feature that the case needs; the text names it."""
+
+
+class Probe(ABC):
+    """Talks to a unit over a link. The run sets `truth` if the true attitude is known; `log` has the sent and received traffic."""
+
+    link: str
+    """`serial`, `can` or `canopen`."""
+
+    def __init__(self, port: Port[Any]) -> None:
+        self.port = port
+        self.log: list[str] = []
+        self.truth: TruthSource | None = None
+
+    def now(self) -> float:
+        """Time of the port, s."""
+        return self.port.now()
+
+    @abstractmethod
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+
+    # --- rows ---
+
+    @abstractmethod
+    def telecommands(self) -> Iterable[Row]:
+        """Return the telecommands that the link carries."""
+
+    @abstractmethod
+    def telemetry_rows(self) -> Iterable[Row]:
+        """Return the telemetry that the link carries."""
+
+    def carries(self, row: Row, item: Field) -> bool:  # noqa: ARG002 -- most links, every row whole
+        """Return whether the link carries a field of a row."""
+        return True
+
+    @abstractmethod
+    def values(self, row: Row) -> dict[str, Value]:
+        """Read the values of a row; one outside its limits fails the case."""
+
+    @abstractmethod
+    def command(self, name: str, **values: Value) -> None:
+        """Send a telecommand by name, which must be accepted."""
+
+    # --- around a case ---
+
+    @abstractmethod
+    def begin(self, *, intrusive: bool) -> None:
+        """Prepare for a case."""
+
+    @abstractmethod
+    def end(self, *, intrusive: bool, passed: bool) -> None:
+        """Check the conditions that must hold after a case, and prepare for the next one.
+
+        Raises `CaseFailed` if they do not hold.
+        """
+
+    @abstractmethod
+    def recover(self) -> None:
+        """Wait for the after-effects of a failed case."""
+
+    # --- around a run ---
+
+    @abstractmethod
+    def identity(self) -> str:
+        """Return what the device reports of its identity."""
+
+    @abstractmethod
+    def silence(self, *, booting: bool) -> str | None:
+        """Return None if the device answers, otherwise the invalid answer or `nothing`."""
+
+    @abstractmethod
+    def prepare(self) -> None:
+        """Record the settings of the device before cases that change them."""
+
+    @abstractmethod
+    def restore(self) -> None:
+        """Restore the settings after such cases."""
 
 
 @dataclass(frozen=True)

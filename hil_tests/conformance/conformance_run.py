@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from starhil.hil_tests.attitude import from_radec_roll
-from starhil.hil_tests.conformance.attitude_cases import TruthSource
 from starhil.hil_tests.conformance.can_probe import CanProbe
-from starhil.hil_tests.conformance.case import Case, CaseFailed
+from starhil.hil_tests.conformance.case import Case, CaseFailed, Probe, TruthSource
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.ports import LivePort
 from starhil.hil_tests.conformance.runner import (
@@ -231,7 +230,7 @@ def _probes(
     links: set[str],
     ports: Mapping[str, str | None],
     stack: ExitStack,
-) -> Iterator[tuple[SerialProbe | CanProbe | CanopenProbe, str]]:
+) -> Iterator[tuple[Probe, str]]:
     """Open the links one after the other; yield the probe of each, and the name of its port."""
     serial, can = ports.get("serial"), ports.get("can")
     if "serial" in links and serial is not None:
@@ -253,7 +252,7 @@ def _probes(
         probe = CanProbe(bus, unit, host=host, device=device, times=request.times, settings=settings)
         yield probe, f"{can} at address {device}"
     if "canopen" in links and can is not None:
-        yield _canopen_probe(request, can, stack), f"{can} at node {request.canopen_node}"
+        yield _canopen_probe(request, unit, can, stack), f"{can} at node {request.canopen_node}"
 
 
 def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
@@ -285,12 +284,13 @@ def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorPr
     return emulator
 
 
-def _canopen_probe(request: ConformanceRequest, can: str, stack: ExitStack) -> CanopenProbe:
+def _canopen_probe(request: ConformanceRequest, unit: Unit, can: str, stack: ExitStack) -> CanopenProbe:
     """Open a CANopen node with the requested EDS, or else the product's."""
     import canopen
     from canopen.objectdictionary import import_od
 
     from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
+    from starhil.hil_tests.judge.canopen import entries
 
     node = int(request.canopen_node or 0)
     text = _eds_text(request)
@@ -301,7 +301,8 @@ def _canopen_probe(request: ConformanceRequest, can: str, stack: ExitStack) -> C
             dictionary = import_od(str(path), node)
         except (canopen.ObjectDictionaryError, ValueError, KeyError) as error:
             raise BenchError(f"{request.eds}: not a valid EDS: {error}") from None
-    return CanopenProbe(stack.enter_context(LivePort(open_can(can), request.speed)), node, dictionary, text)
+    bus = stack.enter_context(LivePort(open_can(can), request.speed))
+    return CanopenProbe(bus, node, dictionary, text, entries(unit, unit.canopen))
 
 
 def _eds_text(request: ConformanceRequest) -> str:

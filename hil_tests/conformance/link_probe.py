@@ -5,18 +5,17 @@ The judge (`starhil.hil_tests.judge`) encodes and decodes; a probe adds the port
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Protocol
 
-from starhil.hil_tests.conformance.attitude_cases import TruthSource
-from starhil.hil_tests.conformance.case import CaseFailed, check, check_equal
+from starhil.hil_tests.conformance.case import CaseFailed, Probe, check, check_equal
 from starhil.hil_tests.conformance.ports import Port
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request, Value
-from starhil.hil_tests.judge.rows import Field, Row
+from starhil.hil_tests.judge.rows import Row
 
 INVALID_ID: Final = "invalid_id"
 INVALID_LENGTH: Final = "invalid_length"
@@ -103,15 +102,13 @@ def lively_row(unit: Unit, can_refuse: Callable[[str], bool]) -> Row:
     return min(unit.telemetry.values(), key=unsuitable)
 
 
-class LinkProbe(ABC):
-    """Talks to a unit over a link.
+class LinkProbe(Probe):
+    """Talks to a unit over a serial or CAN link.
 
-    `settings` are what a run restores; by default, those that can be read. The run sets `truth` if the true attitude is known.
+    `settings` are what a run restores; by default, those that can be read.
     `unsolicited` has the unsolicited telemetry since `drain` or `receive_unsolicited`: messages on serial, frames on CAN.
     """
 
-    link: str
-    """`serial` or `can`."""
     has_unsolicited = True
     """Whether the link carries unsolicited telemetry."""
     numbers = 0
@@ -122,12 +119,10 @@ class LinkProbe(ABC):
     def __init__(
         self, port: Port[Any], unit: Unit, times: ProbeTimes | None, settings: Settings | None = None
     ) -> None:
-        self.port = port
+        super().__init__(port)
         self.unit = unit
         self.times = times or ProbeTimes()
         self.settings = settings or ReadableSettings()
-        self.truth: TruthSource | None = None
-        self.log: list[str] = []
         self.unsolicited: list[Any] = []
         self._prepared = False
 
@@ -199,10 +194,6 @@ class LinkProbe(ABC):
         """Return whether a refusal of a telemetry row differs from its data."""
         return True
 
-    def now(self) -> float:
-        """Time of the port, s."""
-        return self.port.now()
-
     def sleep(self, seconds: float) -> None:
         """Wait; received data are kept."""
         end = self.now() + seconds
@@ -219,10 +210,6 @@ class LinkProbe(ABC):
     def telecommands(self) -> Iterable[Row]:
         """Return the telecommands of the unit."""
         return self.unit.telecommands.values()
-
-    def carries(self, row: Row, item: Field) -> bool:  # noqa: ARG002 -- every row whole
-        """Return whether the link carries a field of a row."""
-        return True
 
     def telemetry_rows(self) -> Iterable[Row]:
         """Return the telemetry of the unit."""

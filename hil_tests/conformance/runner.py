@@ -6,9 +6,9 @@ import fnmatch
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
-from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped
+from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, Probe
 from starhil.hil_tests.errors import BenchError, LinkLostError
 from starhil.hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED
 from starhil.protocol.errors import ProtocolError
@@ -82,37 +82,6 @@ def select_cases(
 
 def _matches(case_id: str, pattern: str) -> bool:
     return case_id == pattern or case_id.startswith(pattern + ".") or fnmatch.fnmatchcase(case_id, pattern)
-
-
-class Probe(Protocol):
-    """The functions of a link that are needed to run cases."""
-
-    log: list[str]
-    """Sent and received traffic."""
-
-    def identity(self) -> str:
-        """Return what the device reports of its identity."""
-
-    def silence(self, *, booting: bool) -> str | None:
-        """Return None if the device answers, otherwise the invalid answer or `nothing`."""
-
-    def prepare(self) -> None:
-        """Record the settings of the device before cases that change them."""
-
-    def restore(self) -> None:
-        """Restore the settings after such cases."""
-
-    def begin(self, *, intrusive: bool) -> None:
-        """Prepare for a case."""
-
-    def end(self, *, intrusive: bool, passed: bool) -> None:
-        """Check the conditions that must hold after a case, and prepare for the next one.
-
-        Raises `CaseFailed` if they do not hold.
-        """
-
-    def recover(self) -> None:
-        """Wait for the after-effects of a failed case."""
 
 
 def run_case(probe: Probe, case: Case[Any]) -> Outcome:

@@ -188,9 +188,7 @@ def objects_of(unit: Unit) -> Objects:
     every = list(canopen.entries(unit, layout))
     found: Objects = {}
     for row in unit.rows:
-        held = {
-            item.slot.offset: item for item in reversed(every) if item.row is row and item.slot is not None
-        }
+        held = {slot.offset: item for item, slot in reversed(canopen.slots(row, every))}
         setters = [item for item in every if item.command is row]
         if row.is_telemetry and held.keys() >= {place.offset for place in canopen.places(row)} and held:
             found[row.kind, row.name] = list(held.values())

@@ -230,13 +230,21 @@ def with_byte_order(slot: Field | None, data: bytes) -> bytes:
     return data[::-1] if slot is not None and slot.order == "big" and slot.type != "bytes" else data
 
 
+def slots(row: Row, found: Iterable[Entry]) -> list[tuple[Entry, Field]]:
+    """Return the entries that hold slots of a row, given by its name, and the slots."""
+    return [
+        (entry, entry.slot)
+        for entry in found
+        if entry.row is not None and entry.row.name == row.name and entry.slot is not None
+    ]
+
+
 def row_data(row: Row, found: Iterable[Entry], read: Callable[[Entry], bytes]) -> bytes:
     """Return the data of a row, read through the entries that hold its slots; a text ends before its NULs."""
     data = bytearray(row.size)
-    for entry in found:
-        if entry.row is row and (slot := entry.slot) is not None:
-            value = with_byte_order(slot, read(entry)).ljust(slot.size, b"\0")
-            data[slot.offset : slot.offset + slot.size] = value
+    for entry, slot in slots(row, found):
+        value = with_byte_order(slot, read(entry)).ljust(slot.size, b"\0")
+        data[slot.offset : slot.offset + slot.size] = value
     return bytes(data)
 
 

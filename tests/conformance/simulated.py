@@ -32,6 +32,7 @@ from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import settings_of
+from starhil.hil_tests.judge.canopen import entries
 from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
@@ -196,13 +197,13 @@ class SimulatedUnit:
         port = SimulatedPort(self)
         times = ProbeTimes(answer_s=0.5, quiet_s=0.1, boot_s=5.0, image_s=10.0)
         self.probe: SerialProbe | CanProbe | CanopenProbe
+        unit = read_unit(self.unit)
         if self.kind == "canopen":
             node = int(self.icd.parameters["canopen_node"].default)
             eds = build_eds(DeviceDictionary(self.icd))
-            self.probe = CanopenProbe(port, node, import_eds(eds, node), eds)
+            self.probe = CanopenProbe(port, node, import_eds(eds, node), eds, entries(unit, unit.canopen))
             self.loop.run_until_complete(asyncio.sleep(1.0))
             return self
-        unit = read_unit(self.unit)
         if self.kind == "serial":
             self.probe = SerialProbe(
                 port, unit, dialect=self.dialect, baud=BAUD, times=times, settings=settings_of(unit)
