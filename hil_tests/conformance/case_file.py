@@ -12,7 +12,8 @@
         { id = "junk", title = "junk sets a flag", lines = "{clear}; 00 55; silence; telemetry status junk=true" },
     ]
 
-`clause` and `intrusive` of a case replace those of its area; a case with a name in braces that the unit lacks is left out.
+`clause` and `intrusive` of a case replace those of its area; a case with a name in braces that the unit
+lacks is left out, an unknown name is an error.
 The steps of `lines` are separated by semicolons or stand in lines of their own:
 
     1F 7F 80 1F FF > 128        raw bytes, and the next answers: telemetry rows by ID
@@ -33,9 +34,9 @@ import json
 import re
 import tomllib
 from collections import ChainMap
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -50,6 +51,7 @@ from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import problems
 
 CUBESPACE_CASES: Final = Path(__file__).with_name("cubespace_cases.toml")
+IN_BRACES: Final = re.compile(r"\{(\w+)\}")
 REPEATED: Final = re.compile(r"\(([^()]*)\)\*(\d+)")
 VERBS: Final = {
     "silence": range(2),
@@ -103,22 +105,11 @@ def _read(path: Path) -> CaseFile:
     """
     try:
         document = tomllib.loads(read_user_text(path))
-        file = CaseFile.model_validate(document)
+        return CaseFile.model_validate(document)
     except ValidationError as error:
         raise BenchError(*(f"{path}: {item}" for item in problems(error, CaseFile, document))) from None
     except (OSError, ValueError) as error:
         raise BenchError(f"{path}: {reason(error)}") from None
-    found = [
-        f"{path}: {area.name}.{item.id}: {step}: {fault}"
-        for area in file.area
-        if area.links != ["canopen"]
-        for item in area.cases
-        for step in _steps(item.lines)
-        if (fault := _fault(step))
-    ]
-    if found:
-        raise BenchError(*found)
-    return file
 
 
 def _steps(lines: str) -> list[str]:
@@ -127,19 +118,26 @@ def _steps(lines: str) -> list[str]:
     return [step.strip() for step in re.split("[;\n]", whole) if step.strip()]
 
 
-def _fault(step: str) -> str | None:
-    """Return what is wrong with a step; None if nothing is, or if that depends on names in braces."""
-    verb, *words = step.split()
-    counts = VERBS.get(verb)
-    if "{" in step:
-        return None
-    if counts is not None:
-        numbers = verb in ("silence", "sleep")
-        right = len(words) in counts and (not numbers or all(map(SECONDS.fullmatch, words)))
-        return None if right else f"wrong words after {verb!r}"
-    sent, _, answers = step.partition(">")
-    raw = all(map(SENT.fullmatch, sent.split())) and all(map(ANSWER.fullmatch, answers.split()))
-    return None if raw and sent else f"neither raw traffic nor a known step{did_you_mean(verb, VERBS)}"
+def _faults(lines: str) -> Iterator[str]:
+    """Yield what is wrong with the steps of a case."""
+    for step in _steps(lines):
+        verb, *words = step.split()
+        counts = VERBS.get(verb)
+        if counts is not None:
+            numbers = verb in ("silence", "sleep")
+            if len(words) not in counts or (numbers and not all(map(SECONDS.fullmatch, words))):
+                yield f"{step}: wrong words after {verb!r}"
+            continue
+        sent, _, answers = step.partition(">")
+        raw = all(map(SENT.fullmatch, sent.split())) and all(map(ANSWER.fullmatch, answers.split()))
+        if not raw or not sent:
+            yield f"{step}: neither raw traffic nor a known step{did_you_mean(verb, VERBS)}"
+
+
+@cache
+def _names_of_links() -> frozenset[str]:
+    """Return all names in braces of serial and CAN, of which a unit may lack some."""
+    return frozenset(IN_BRACES.findall(CUBESPACE_CASES.read_text(encoding="utf-8")))
 
 
 def hold(lines: str, probe: LinkProbe) -> None:
@@ -180,7 +178,7 @@ def text_cases(
     link: str,
     names: dict[str, str],
     run: Callable[[str, Any], None] = hold,
-    faults: Callable[[str], Iterable[str]] = lambda _lines: (),
+    faults: Callable[[str], Iterable[str]] = _faults,
 ) -> list[Case[Any]]:
     """Return the cases of a file for a link; `names` are its names in braces, `run` carries out lines with a probe.
 
@@ -191,12 +189,21 @@ def text_cases(
     found, wrong = [], []
     for area in file.area:
         for item in area.cases if link in area.links else ():
-            with suppress(KeyError):
+            try:
                 texts = item.id, item.title, item.clause or area.clause, item.lines
                 name, title, clause, lines = (text.format_map(known) for text in texts)
-                changes = area.intrusive if item.intrusive is None else item.intrusive
-                found.append(case_in(area.name, name, title, partial(run, lines), clause, intrusive=changes))
-                wrong += [f"{path}: {area.name}.{name}: {fault}" for fault in faults(lines)]
+            except KeyError as missing:
+                name = missing.args[0]
+                if name not in _names_of_links():
+                    close = did_you_mean(name, {*known, *_names_of_links()})
+                    wrong.append(f"{path}: {area.name}.{item.id}: unknown name {name!r} in braces{close}")
+                continue
+            except ValueError as error:
+                wrong.append(f"{path}: {area.name}.{item.id}: braces: {error}")
+                continue
+            changes = area.intrusive if item.intrusive is None else item.intrusive
+            found.append(case_in(area.name, name, title, partial(run, lines), clause, intrusive=changes))
+            wrong += [f"{path}: {area.name}.{name}: {fault}" for fault in faults(lines)]
     if wrong:
         raise BenchError(*wrong)
     return found

@@ -9,7 +9,7 @@
 
 An answer without an ID belongs to the oldest request that has not been answered, so requests are noted in order.
 
-One line may have several formats (`[[link.serial.format]]`), told apart by the first byte of an answer, and requests and
+One line may have several formats (`[[link.serial.format]]`), distinguished by the first byte of an answer, and requests and
 answers that are texts (libgs hyp_st200.c, whose driver looks for READY in what it reads, and for F1 in a record):
 
     OBC  ► show record CR                      text (`request`)

@@ -86,6 +86,9 @@ def test_a_row_that_reports_the_start_is_awaited_after_a_reset(
         ("drain; silence soon", "silence soon: wrong words after 'silence'"),
         ("sleep", "sleep: wrong words after 'sleep'"),
         ("1F 7", "1F 7: neither raw traffic nor a known step"),
+        ("{clear}; 00 {zzz}", "unknown name 'zzz' in braces"),
+        ("00 {}", "braces: Format string contains positional fields"),
+        ("{clear}; sleep 1 2", "sleep 1 2: wrong words after 'sleep'"),
         ("1F 7F > ack", "1F 7F > ack: neither raw traffic nor a known step"),
     ],
 )
@@ -93,7 +96,8 @@ def test_a_wrong_step_of_a_file_is_named_before_the_run(lines: str, message: str
     folder = unit_with(tmp_path / "unit", "")
     path = folder / "more_cases.toml"
     path.write_text(
-        f'[[area]]\nname = "more"\nclause = "ICD 5"\ncases = [{{ id = "a", title = "t", lines = "{lines}" }}]\n'
+        '[texts]\nclear = "drain"\n[[area]]\nname = "more"\nclause = "ICD 5"\n'
+        f'cases = [{{ id = "a", title = "t", lines = "{lines}" }}]\n'
     )
     with pytest.raises(BenchError) as caught:
         serial_suite(read_unit(folder))
@@ -174,7 +178,7 @@ links = ["serial"]
 cases = [
     { id = "right", title = "this unit has booted once", lines = "00 55 (00)*3; silence; sleep 1; drain; {boots}" },
     { id = "wrong", title = "it has not booted often", lines = "{boots}; telemetry attitude boots=1 boots=7", intrusive = true },
-    { id = "none", title = "a row that the unit lacks", lines = "{no_such_row}" },
+    { id = "none", title = "a row that the unit lacks", lines = "{long}" },
 ]
 """
 
