@@ -86,9 +86,7 @@ def _telecommand(name: str, icd: InterfaceDefinition) -> Row:
 
 
 def _member(name: str, enum: EnumDefinition) -> str:
-    if name not in enum.values:
-        known = sorted(enum.values)
-        raise ValueError(f"must be one of {', '.join(known)}, not {name!r}{did_you_mean(name, known)}")
+    enum.number(name)
     return name
 
 
