@@ -67,6 +67,7 @@ class Run:
         host = TruthHost(
             self.clock,
             self.profile.run.clock,
+            self.profile.start_unix_s,
             self.time_passes,
             self._step_in_lock,
             self.record,

@@ -40,6 +40,7 @@ class Surroundings:
         self._radiation = profile.radiation
         self._start_unix_s = profile.start_unix_s
         self._orbit = orbit_of(profile)
+        self._lacks_orbit = False
         self._thermal = thermal
         self._now_ns = now_ns
 
@@ -48,11 +49,14 @@ class Surroundings:
         t_s = at_ns / NANOSECONDS
         state, unix_s = self.truth.state(t_s), self._start_unix_s + t_s
         try:
-            return state.completed(unix_s, self._orbit)
+            completed = state.completed(unix_s, self._orbit)
         except EmulatorError as error:
-            log.warning("%s; the run continues without an orbit", error)
-            self._orbit = None
+            if not self._lacks_orbit:
+                log.warning("%s; the run continues without an orbit", error)
+            self._lacks_orbit = True
             return state.completed(unix_s, None)
+        self._lacks_orbit = False
+        return completed
 
     def conditions(self, truth: TruthState) -> Conditions:
         """Return the current conditions of the detector."""

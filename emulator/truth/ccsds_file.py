@@ -3,16 +3,21 @@
 Both notations are read into the same segments: a dictionary of keywords, and rows of a date and numbers. A quaternion
 describes the transformation from REF_FRAME_A to REF_FRAME_B as an attitude matrix does, so that the one that rotates
 vectors is its conjugate. One of the two frames must be inertial and known (`standard_frames`), the other is the body.
+
+Nothing is interpolated from one segment to the next (504.0-B-2 4.2.4.8.3, 502.0-B-3 5.2.4.6). Segments may overlap if
+their useable spans do not, but for a shared end. In version 1 the direction of the transformation and the place of the
+scalar have no default, so that files without them are rejected; version 2 has only A to B, and the scalar last.
 """
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -22,6 +27,7 @@ from starhil.emulator.truth.feed_message import NORM_TOLERANCE
 from starhil.emulator.truth.source import MAX_RATE_DEG_S
 from starhil.emulator.truth.standard_frames import (
     NANOSECONDS,
+    Block,
     Row,
     euler_turns,
     icrs_to,
@@ -38,11 +44,16 @@ from starid.files import read_number
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
+log = logging.getLogger("starhil.truth")
+
 TYPES: Final = {"QUATERNION": 4, "EULER_ANGLE": 3, "QUATERNION/ANGVEL": 7, "EULER_ANGLE/ANGVEL": 6}
 """Attitude types that are read, and the numbers in a row of each."""
 
 XML_ORDER: Final = {"EPOCH": 0, "Q1": 1, "Q2": 2, "Q3": 3, "QC": 4}
 """Elements that come first in a row, whatever their order in the file."""
+
+
+T = TypeVar("T")
 
 
 @dataclass
@@ -62,9 +73,13 @@ def read_aem(path: Path, text: str) -> FileTruth:
     """Read the attitudes of an AEM."""
     where = f"truth file {path}"
     version, segments = _segments(where, "AEM", text)
-    kinds = {segment.keywords.get("ATTITUDE_TYPE", "").upper() for segment in segments}
-    if version == "1" and kinds != {"QUATERNION"}:
-        raise EmulatorError(f"{where}: of version 1, only ATTITUDE_TYPE QUATERNION is read")
+    for number, segment in enumerate(segments, 1):
+        if version != "1":
+            break
+        if _keyword(f"{where}, segment {number}", segment, "ATTITUDE_TYPE").upper() != "QUATERNION":
+            raise EmulatorError(f"{where}: of version 1, only ATTITUDE_TYPE QUATERNION is read")
+        for key in ("ATTITUDE_DIR", "QUATERNION_TYPE"):
+            _keyword(f"{where}, segment {number}", segment, key)
     return attitudes_of(path, segments)
 
 
@@ -76,9 +91,21 @@ def read_oem(path: Path, text: str) -> OrbitTable:
 
 def attitudes_of(path: Path, segments: Sequence[Segment]) -> FileTruth:
     """Return the truth of segments with the keywords of an AEM, in any notation."""
-    blocks = [_attitudes(f"truth file {path}, segment {n}", each) for n, each in enumerate(segments, 1)]
+    blocks = []
+    for number, segment in enumerate(segments, 1):
+        where = f"truth file {path}, segment {number}"
+        rows = _attitudes(where, segment)
+        if rows:
+            blocks.append(_block(where, segment, rows))
     methods = {segment.keywords.get("INTERPOLATION_METHOD", "").upper() for segment in segments}
-    return truth_of(path, blocks, smooth="LINEAR" not in methods)
+    truth = truth_of(path, blocks, smooth="LINEAR" not in methods)
+    if truth.rates_rad_s is None:
+        log.warning(
+            "truth file %s: has no rates, so the sense of its attitudes cannot be checked; "
+            "compare one of them with its source",
+            path,
+        )
+    return truth
 
 
 def orbit_of(path: Path, segments: Sequence[Segment]) -> OrbitTable:
@@ -88,13 +115,25 @@ def orbit_of(path: Path, segments: Sequence[Segment]) -> OrbitTable:
     centres = {_keyword(where, segment, "CENTER_NAME").upper() for segment in segments}
     if len(frames) != 1 or centres != {"EARTH"}:
         raise EmulatorError(f"{where}: needs one reference frame, and the Earth as its centre")
-    rows: dict[int, list[float]] = {}
-    for segment in segments:
-        for at_ns, numbers in segment.rows:
-            if len(numbers) not in (6, 9):
-                raise EmulatorError(f"{where}: {len(numbers)} numbers in a row; position and velocity are 6")
-            rows.setdefault(at_ns, [1e3 * number for number in numbers[:6]])
-    return orbit_of_rows(path, icrs_to(where, frames.pop()), list(rows), list(rows.values()))
+    blocks = []
+    for number, segment in enumerate(segments, 1):
+        for size in {len(numbers) for _, numbers in segment.rows} - {6, 9}:
+            raise EmulatorError(f"{where}: {size} numbers in a row; position and velocity are 6")
+        rows = [[1e3 * number for number in numbers[:6]] for _, numbers in segment.rows]
+        if rows:
+            blocks.append(_block(f"{where}, segment {number}", segment, rows))
+    return orbit_of_rows(path, icrs_to(where, frames.pop()), blocks)
+
+
+def _block(where: str, segment: Segment, rows: Sequence[T]) -> Block[T]:
+    """Return converted rows of a segment with its dates and its useable span."""
+    usable = [
+        unix_ns(where, segment.keywords[key], segment.keywords.get("TIME_SYSTEM", "UTC"))
+        if key in segment.keywords
+        else None
+        for key in ("USEABLE_START_TIME", "USEABLE_STOP_TIME")
+    ]
+    return Block(where, [at_ns for at_ns, _ in segment.rows], rows, (usable[0], usable[1]))
 
 
 def write_aem(truth: FileTruth, sensor: str) -> str:
@@ -106,14 +145,22 @@ def write_aem(truth: FileTruth, sensor: str) -> str:
     if truth.rates_rad_s is not None:
         kind, frame_of_rates = "QUATERNION/ANGVEL", [f"ANGVEL_FRAME = {sensor}"]
         numbers = np.hstack((numbers, np.degrees(truth.rates_rad_s)))
-    lines = [
-        *("CCSDS_AEM_VERS = 2.0", f"CREATION_DATE = {dates[0]}", "ORIGINATOR = starhil", "META_START"),
-        *("OBJECT_NAME = STARHIL", "OBJECT_ID = UNKNOWN", "REF_FRAME_A = GCRF", f"REF_FRAME_B = {sensor}"),
-        *("TIME_SYSTEM = UTC", f"START_TIME = {dates[0]}", f"STOP_TIME = {dates[-1]}"),
-        *(f"ATTITUDE_TYPE = {kind}", *frame_of_rates, "META_STOP", "DATA_START"),
-        *(" ".join((date, *map(repr, row))) for date, row in zip(dates, numbers.tolist(), strict=True)),
-        "DATA_STOP",
-    ]
+    lines = ["CCSDS_AEM_VERS = 2.0", f"CREATION_DATE = {dates[0]}", "ORIGINATOR = starhil"]
+    for span in truth.spans:
+        start, stop = dates[span.first], dates[span.last]
+        begin, end = (_date(begin_ns + round(t * NANOSECONDS)) for t in (span.begin_s, span.end_s))
+        useable = [f"USEABLE_START_TIME = {begin}", f"USEABLE_STOP_TIME = {end}"]
+        lines += [
+            *("META_START", "OBJECT_NAME = STARHIL", "OBJECT_ID = UNKNOWN"),
+            *("REF_FRAME_A = GCRF", f"REF_FRAME_B = {sensor}", "TIME_SYSTEM = UTC", f"START_TIME = {start}"),
+            *(useable if (begin, end) != (start, stop) else ()),
+            *(f"STOP_TIME = {stop}", f"ATTITUDE_TYPE = {kind}", *frame_of_rates, "META_STOP", "DATA_START"),
+            *(
+                " ".join((date, *map(repr, row)))
+                for date, row in zip(dates[span.rows], numbers[span.rows].tolist(), strict=True)
+            ),
+            "DATA_STOP",
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -132,10 +179,9 @@ def _attitudes(where: str, segment: Segment) -> list[Row]:
         return []
     for size in {len(numbers) for _, numbers in segment.rows} - {TYPES[kind]}:
         raise EmulatorError(f"{where}: {size} numbers in a row of {kind}, which has {TYPES[kind]}")
-    times, rows = zip(*segment.rows, strict=True)
-    values, rates = np.array(rows), None
+    values, rates = np.array([numbers for _, numbers in segment.rows]), None
     if kind.startswith("QUATERNION"):
-        scalar_first = segment.keywords.get("QUATERNION_TYPE", "LAST").upper() == "FIRST"
+        scalar_first = _choice(where, segment, "QUATERNION_TYPE", "LAST", "FIRST")
         quaternions, values = np.roll(values[:, :4], -1 if scalar_first else 0, axis=1), values[:, 4:]
         if not (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= NORM_TOLERANCE).all():
             raise EmulatorError(f"{where}: a quaternion is not of length 1")
@@ -143,14 +189,14 @@ def _attitudes(where: str, segment: Segment) -> list[Row]:
     else:
         turns = euler_turns(where, _keyword(where, segment, "EULER_ROT_SEQ"), values[:, :3])
         values = values[:, 3:]
-    is_inverse = segment.keywords.get("ATTITUDE_DIR", "A2B").upper() == "B2A"
+    is_inverse = _choice(where, segment, "ATTITUDE_DIR", "A2B", "B2A")
     to_body = turns if is_inverse != of_a else turns.inv()
     if kind.endswith("/ANGVEL"):
         rates = _rates_of_body(where, segment, np.radians(values), frames, to_body, of_a=of_a)
     quaternions = (to_body * to_reference).as_quat()
     return [
-        Row(at_ns, Attitude(quaternion), None if rates is None else rates[row])
-        for row, (at_ns, quaternion) in enumerate(zip(times, quaternions, strict=True))
+        Row(Attitude(quaternion), None if rates is None else rates[row])
+        for row, quaternion in enumerate(quaternions)
     ]
 
 
@@ -216,7 +262,7 @@ def _from_xml(where: str, kind: str, text: str) -> tuple[str | None, list[Segmen
                 leaves = [each for each in state.iter() if len(each) == 0 and each.tag != "COMMENT"]
                 leaves.sort(key=lambda leaf: XML_ORDER.get(leaf.tag, len(XML_ORDER)))
                 rows.append(_row(where, keywords, [(leaf.text or "").strip() for leaf in leaves]))
-        keywords.pop("QUATERNION_TYPE", None)  # the elements have names
+        keywords["QUATERNION_TYPE"] = "LAST"  # the elements have names, by which they are ordered
         segments.append(Segment(keywords, rows))
     return found.get("version", ""), segments
 
@@ -238,6 +284,14 @@ def _keyword(where: str, segment: Segment, key: str) -> str:
     if key not in segment.keywords:
         raise EmulatorError(f"{where}: {key} is missing")
     return segment.keywords[key]
+
+
+def _choice(where: str, segment: Segment, key: str, default: str, other: str) -> bool:
+    """Return whether a keyword has its other value instead of the default one."""
+    value = segment.keywords.get(key, default).upper()
+    if value not in (default, other):
+        raise EmulatorError(f"{where}: {key} must be {default} or {other}")
+    return value == other
 
 
 def _date(at_ns: int) -> str:

@@ -28,6 +28,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.feed_message import checked_attitude
 from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.orbit import OrbitState
+from starhil.emulator.truth.plausibility import doubt_of_orbit
 from starhil.emulator.truth.source import MAX_RATE_DEG_S
 from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude, rate_between
@@ -87,6 +88,9 @@ def read_csv(path: Path, text: str) -> FileTruth:
                 [row[name] for name in names] for names in (POSITION_COLUMNS, VELOCITY_COLUMNS)
             )
             orbit.append(OrbitState(np.array(position), np.array(velocity)))
+            doubt = doubt_of_orbit(orbit[-1])
+            if doubt:
+                raise EmulatorError(f"{where}: {doubt}")
         if has_rates:
             rates.append([math.radians(row[name]) for name in RATE_COLUMNS])
         elif len(times) > 1:

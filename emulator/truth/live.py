@@ -13,6 +13,9 @@ Between two messages the attitude is interpolated. After the last one it is prop
 ``stale_s``; then it is held and flagged ``stale``. With ``timeline = "run"`` it is also stale if the last ``t`` is
 older than this.
 
+A position, velocity or date that cannot be right (`starhil.emulator.truth.plausibility`) is used as it was sent, but
+reported with the likely mistake, and the truth is flagged ``implausible``.
+
 A rejected message is counted, logged (the 1st, 10th, 100th …) and otherwise ignored. Messages whose ``t`` does not
 increase are rejected, except that a jump back by more than `RESTART_S` starts a new timeline.
 """
@@ -31,6 +34,7 @@ from starhil.emulator.clock import MAX_SCALE
 from starhil.emulator.truth.feed_message import FeedMessage, JsonFormat
 from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError, FeedRates
 from starhil.emulator.truth.orbit import interpolate_orbit
+from starhil.emulator.truth.plausibility import doubt_of_date, doubt_of_orbit
 from starhil.emulator.truth.sender_clock import SenderClock, SenderSpeed
 from starhil.emulator.truth.simulator_42 import Format42
 from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus
@@ -72,7 +76,10 @@ class LiveTruth:
         self.accepted = 0
         self.refused = 0
         self.last_fault = ""
+        self.doubt = ""
+        """Why position, velocity or date in the last message cannot be right; an empty text if they can."""
         self._start = attitude
+        self._run_unix_s: float | None = None
         self._clock_speed = 1.0
         self._clock = SenderClock(self._clock_speed)
         self._rates = FeedRates(timed=True)
@@ -83,9 +90,10 @@ class LiveTruth:
         self._times: deque[float] = deque(maxlen=HISTORY)
         self._states: deque[TruthState] = deque(maxlen=HISTORY)
 
-    def set_clock_speed(self, clock_speed: float) -> None:
-        """Set the simulation time per wall time, by default 1; 0 if time passes only on request."""
+    def set_run(self, clock_speed: float, start_unix_s: float) -> None:
+        """Set the simulation time per wall time, by default 1, 0 if time passes only on request; and the date of the run."""
         self._clock_speed = clock_speed
+        self._run_unix_s = start_unix_s
         self.begin_timeline()
 
     def receive(self, data: bytes | str, received_s: float) -> bool:
@@ -139,6 +147,16 @@ class LiveTruth:
         self._received_s = received_s
         self._times.append(t)
         self._states.append(TruthState(message.attitude, rate, orbit=message.orbit, unix_s=message.unix_s))
+        self._check_plausibility(message)
+
+    def _check_plausibility(self, message: FeedMessage) -> None:
+        """Set `doubt`, and report it once."""
+        doubt = "" if message.orbit is None else doubt_of_orbit(message.orbit)
+        if not doubt and message.unix_s is not None and self._run_unix_s is not None:
+            doubt = doubt_of_date(message.unix_s, self._run_unix_s)
+        if doubt and not self.doubt:
+            log.warning("truth feed: implausible: %s", doubt)
+        self.doubt = doubt
 
     @property
     def speed(self) -> SenderSpeed:
@@ -198,8 +216,12 @@ class LiveTruth:
     def state(self, t_s: float) -> TruthState:
         """Return the truth at a simulation time in seconds."""
         state = self._state(t_s)
-        if self.speed.differs and state.status not in (TruthStatus.WAITING, TruthStatus.STALE):
+        if state.status in (TruthStatus.WAITING, TruthStatus.STALE):
+            return state
+        if self.speed.differs:
             return replace(state, status=TruthStatus.WRONG_SPEED)
+        if self.doubt:
+            return replace(state, status=TruthStatus.IMPLAUSIBLE)
         return state
 
     def _state(self, t_s: float) -> TruthState:

@@ -44,10 +44,14 @@ class TruthStatus(StrEnum):
     """The live feed has been silent for too long: the attitude is held."""
     WRONG_SPEED = "wrong_speed"
     """The live feed runs at another speed than the clock: its messages hold from their receipt."""
+    IMPLAUSIBLE = "implausible"
+    """The live feed gives a position, velocity or date that cannot be right, such as one in other units."""
     BEFORE_START = "before_start"
-    """Before the first row of a file: its first attitude, at rest."""
+    """Before the begin of a file: its first attitude, at rest."""
+    GAP = "gap"
+    """Between two segments of a file: the last attitude of the earlier one, at rest."""
     AFTER_END = "after_end"
-    """After the last row of a file or segment of a slew: its last attitude, at rest."""
+    """After the end of a file or the last segment of a slew: its last attitude, at rest."""
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,14 @@ programs that use SPICE, this one finds relative names from the working director
 relative to the Earth of the spacecraft to which the structure of the CK belongs: of -44000, that is -44.
 
 SPICE transforms to J2000, which is ICRS there, and interpolates. Rows are SPICE's at the times of the records of
-segments of type 3, between which the rotation is uniform, and at steps of `STEP_S` in segments of other types.
+segments of type 3, between which the rotation is uniform, and at steps of `STEP_S` in segments of other types, within
+each interval for which the CK has attitudes. Segments of type 1 have none between their records, and are not read.
 """
 
 from __future__ import annotations
 
 import threading
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,7 +22,7 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.orbit import OrbitState
-from starhil.emulator.truth.standard_frames import NANOSECONDS, Row, truth_of
+from starhil.emulator.truth.standard_frames import NANOSECONDS, Block, Row, truth_of
 from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
 
@@ -31,8 +33,17 @@ J2000_UNIX_S: Final = 946_728_000.0
 """2000-01-01T12:00:00 UTC, from which SPICE counts."""
 
 EARTH: Final = 399
-FORWARD: Final = 3
+DISCRETE: Final = 1
+"""Type of segments without attitudes between their records."""
+
+UNIFORM: Final = 3
 """Type of segments whose records can be read one by one."""
+
+NEEDS_RATES: Final = False
+"""Whether SPICE is to leave out segments without rates."""
+
+MAX_INTERVALS: Final = 200_000
+"""Largest number of intervals of a CK."""
 
 TICKS_PER_S: Final = 1_000_000
 """Resolution of the clock of a written CK."""
@@ -91,9 +102,10 @@ def _kernels(spice: Any, path: Path) -> Iterator[None]:
         try:
             yield
         except spice.exceptions.SpiceyError as error:
-            raise EmulatorError(
-                f"{path}: SPICE: {' '.join(str(error.long or error.short).split())}"
-            ) from None
+            said = (
+                getattr(error, "long", "") or getattr(error, "short", "") or str(error)
+            )  # not all have both
+            raise EmulatorError(f"{path}: SPICE: {' '.join(said.split())}") from None
         finally:
             spice.kclear()
 
@@ -109,39 +121,61 @@ def read_kernels(path: Path) -> FileTruth:
             raise EmulatorError(
                 f"truth file {path}: its CKs have {len(structures)} structures, must have one"
             )
-        blocks = [rows for name in kernels for rows in _segments(spice, name)]
+        (structure,) = structures
+        blocks = [block for name in kernels for block in _blocks(spice, path, name, structure)]
     return truth_of(path, blocks, smooth=False)
 
 
-def _segments(spice: Any, kernel: str) -> list[list[Row]]:
-    """Return the rows of each segment of a CK."""
+def _blocks(spice: Any, path: Path, kernel: str, structure: int) -> Iterator[Block[Row]]:
+    """Yield the rows of each interval of each segment of a CK."""
+    cell = spice.cell_double(2 * MAX_INTERVALS)
+    covered = spice.ckcov(kernel, structure, NEEDS_RATES, "INTERVAL", 0.0, "SCLK", cell)
+    intervals = [spice.wnfetd(covered, number) for number in range(spice.wncard(covered))]
     segments = []
     handle = spice.dafopr(kernel)
     try:
         spice.dafbfs(handle)
         while spice.daffna():
             summary = spice.dafgs(5)
-            (begin, end), (structure, _, kind, has_rates, *_) = spice.dafus(summary, 2, 6)
-            clock = spice.ckmeta(structure, "SCLK")
-            if kind == FORWARD:
+            (begin, end), (_, _, kind, has_rates, *_) = spice.dafus(summary, 2, 6)
+            if kind == DISCRETE:
+                raise EmulatorError(
+                    f"truth file {path}: a segment of type 1 in its CK has no attitudes between its records; "
+                    "write it as type 3"
+                )
+            records = None
+            if kind == UNIFORM:
                 count = spice.cknr03(handle, summary)
-                ticks = [spice.ckgr03(handle, summary, number)[0] for number in range(1, count + 1)]
-            else:
-                first, last = (spice.sct2e(clock, tick) for tick in (begin, end))
-                count = min(int((last - first) / STEP_S) + 2, MAX_ROWS)
-                inner = [spice.sce2c(clock, et) for et in np.linspace(first, last, count)[1:-1]]
-                ticks = [begin, *inner, end]
-            segments.append((structure, ticks, bool(has_rates)))
+                records = [spice.ckgr03(handle, summary, number)[0] for number in range(1, count + 1)]
+            segments.append((begin, end, bool(has_rates), records))
     finally:
         spice.dafcls(handle)
     # SPICE has one search at a time, which reading attitudes would end
-    return [
-        [_row(spice, structure, tick, has_rates=has_rates) for tick in ticks]
-        for structure, ticks, has_rates in segments
-    ]
+    for number, (begin, end, has_rates, records) in enumerate(segments, 1):
+        low = bisect_left(intervals, begin, key=lambda interval: interval[1])
+        high = bisect_right(intervals, end, key=lambda interval: interval[0])
+        for first, last in ((max(begin, first), min(end, last)) for first, last in intervals[low:high]):
+            if records is None:
+                ticks = _steps(spice, structure, first, last)
+            else:
+                ticks = records[bisect_left(records, first) : bisect_right(records, last)]
+            rows = [_row(spice, structure, tick, has_rates=has_rates) for tick in ticks]
+            where = f"truth file {path}, segment {number}"
+            if rows:
+                yield Block(where, [at_ns for at_ns, _ in rows], [row for _, row in rows])
 
 
-def _row(spice: Any, structure: int, tick: float, *, has_rates: bool) -> Row:
+def _steps(spice: Any, structure: int, first: float, last: float) -> list[float]:
+    """Return times from one tick of a clock to another, at most `STEP_S` apart."""
+    clock = spice.ckmeta(structure, "SCLK")
+    begin, end = (spice.sct2e(clock, tick) for tick in (first, last))
+    count = min(int((end - begin) / STEP_S) + 2, MAX_ROWS)
+    inner = [spice.sce2c(clock, et) for et in np.linspace(begin, end, count)[1:-1]]
+    return [first, *inner, *([last] if last > first else ())]
+
+
+def _row(spice: Any, structure: int, tick: float, *, has_rates: bool) -> tuple[int, Row]:
+    """Return the date of a tick as Unix time, nanoseconds, and what SPICE has there."""
     rate, orbit = None, None
     if has_rates:
         matrix, rate, _ = spice.ckgpav(structure, tick, 0.0, "J2000")
@@ -153,11 +187,11 @@ def _row(spice: Any, structure: int, tick: float, *, has_rates: bool) -> Row:
         state, _ = spice.spkez(spice.ckmeta(structure, "SPK"), et, "J2000", "NONE", EARTH)
         orbit = OrbitState(1e3 * state[:3], 1e3 * state[3:])
     unix_s = et - spice.deltet(et, "ET") + J2000_UNIX_S
-    return Row(round(unix_s * NANOSECONDS), Attitude.from_matrix(matrix), rate, orbit)
+    return round(unix_s * NANOSECONDS), Row(Attitude.from_matrix(matrix), rate, orbit)
 
 
 def write_kernels(truth: FileTruth, path: Path, structure: int) -> None:
-    """Write the rows of a truth with dates as a CK, its clock, the leap seconds, and a meta-kernel of these.
+    """Write the spans of a truth with dates as segments of a CK, its clock, the leap seconds, and a meta-kernel of these.
 
     Parameters
     ----------
@@ -168,25 +202,29 @@ def write_kernels(truth: FileTruth, path: Path, structure: int) -> None:
     """
     spice = load_spice()
     files = {suffix: path.with_suffix(suffix) for suffix in (".tls", ".tsc", ".bc")}
-    matrices = np.array([attitude.matrix for attitude in truth.attitudes])
-    ticks = TICKS_PER_S * (truth.times_s - truth.times_s[0])
-    rates = np.zeros((len(ticks), 3))
-    if truth.rates_rad_s is not None:
-        rates = np.einsum("nji,nj->ni", matrices, truth.rates_rad_s)
+    has_rates = truth.rates_rad_s is not None
     with _kernels(spice, path):
         for file in files.values():
             file.unlink(missing_ok=True)  # SPICE does not overwrite
         files[".tls"].write_text(_leap_seconds(), encoding="ascii")
         spice.furnsh(str(files[".tls"]))
-        begin_et = (truth.start_unix_s or 0.0) + float(truth.times_s[0]) - J2000_UNIX_S
+        zero_s = truth.spans[0].begin_s
+        begin_et = (truth.start_unix_s or 0.0) + zero_s - J2000_UNIX_S
         begin_et += spice.deltet(begin_et, "UTC")
         clock = CLOCK.replace("$", str(-structure // 1000)).format(spice.unitim(begin_et, "ET", "TDT"))
         files[".tsc"].write_text(clock, encoding="ascii")
         handle = spice.ckopn(str(files[".bc"]), "starhil", 0)
-        spice.ckw03(
-            handle, ticks[0], ticks[-1], structure, "J2000", truth.rates_rad_s is not None, "starhil",
-            len(ticks), ticks, [spice.m2q(matrix) for matrix in matrices], rates, 1, ticks[:1],
-        )  # fmt: skip
+        for span in truth.spans:
+            times, states = truth.states_in(span)
+            ticks = TICKS_PER_S * (times - zero_s)
+            matrices = np.array([state.attitude.matrix for state in states])
+            rates = np.zeros((len(ticks), 3))
+            if has_rates:
+                rates = np.einsum("nji,nj->ni", matrices, [state.rate_rad_s for state in states])
+            spice.ckw03(
+                handle, ticks[0], ticks[-1], structure, "J2000", has_rates, "starhil",
+                len(ticks), ticks, [spice.m2q(matrix) for matrix in matrices], rates, 1, ticks[:1],
+            )  # fmt: skip
         spice.ckcls(handle)
         names = ", ".join(f"'{file.name}'" for file in files.values())
         path.write_text(META.format(names), encoding="ascii")

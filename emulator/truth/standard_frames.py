@@ -7,17 +7,19 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate, pairwise
 from pathlib import Path
 from time import strptime
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.feed_rates import FeedError, FeedRates
 from starhil.emulator.truth.orbit import OrbitState
+from starhil.emulator.truth.plausibility import doubt_of_orbit
 from starhil.emulator.truth.source import Vector
-from starhil.emulator.truth.table import FileTruth, OrbitTable
+from starhil.emulator.truth.table import FileTruth, OrbitTable, Span
 from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.earth import utc_of_tai
@@ -44,10 +46,25 @@ DATES: Final = ("%Y-%m-%dT%H:%M:%S", "%Y-%jT%H:%M:%S", "%d %b %Y %H:%M:%S")
 class Row:
     """A row of a file with dates: attitude ICRS→body, body rate in rad/s, position and velocity in GCRS."""
 
-    unix_ns: int
     attitude: Attitude
     rate_rad_s: Vector | None = None
     orbit: OrbitState | None = None
+
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Block(Generic[T]):
+    """Rows of a motion without interruption, with their dates, at least one."""
+
+    where: str
+    """File and segment, for messages."""
+    dates_ns: Sequence[int]
+    """Unix times, nanoseconds."""
+    rows: Sequence[T]
+    usable_ns: tuple[int | None, int | None] = (None, None)
+    """Dates from which and to which the block holds, if some rows only support the interpolation."""
 
 
 @lru_cache
@@ -88,54 +105,91 @@ def unix_ns(where: str, text: str, scale: str = "UTC") -> int:
     return label_ns + round((utc_of_tai(tai_s) - whole) * NANOSECONDS)
 
 
-def truth_of(path: Path, blocks: Sequence[Sequence[Row]], *, smooth: bool) -> FileTruth:
-    """Return the truth of the rows of a file, in blocks of continuous motion; a block may begin where the last one ends.
+def truth_of(path: Path, blocks: Sequence[Block[Row]], *, smooth: bool) -> FileTruth:
+    """Return the truth of the blocks of a file.
 
-    EmulatorError if dates do not increase, or rates contradict attitudes: the quaternion has the wrong sense.
+    EmulatorError if dates do not increase, blocks overlap, or rates contradict attitudes: the quaternion has the wrong
+    sense.
     """
-    rows: list[Row] = []
-    for number, block in enumerate(blocks, 1):
-        where = f"truth file {path}, block {number}"
-        if rows and block and block[0].unix_ns == rows[-1].unix_ns:
-            rows.pop()
-        check = FeedRates(timed=True)
-        for row in block:
-            if rows and row.unix_ns <= rows[-1].unix_ns:
-                raise EmulatorError(f"{where}: a date is not later than the one before")
-            rows.append(row)
-            try:
-                check.body_rate((row.unix_ns - rows[0].unix_ns) / NANOSECONDS, row.attitude, row.rate_rad_s)
-            except FeedError as error:
-                fault = str(error).partition("; ")[0].replace("q,", "the quaternion,")
-                raise EmulatorError(
-                    f"{where}, row {len(rows)}: {fault}; its sense or its frames are wrong"
-                ) from None
-    if not rows:
+    if not blocks:
         raise EmulatorError(f"truth file {path}: no rows")
+    spans_ns = _spans_ns(blocks)
+    zero_ns = spans_ns[0][0]
+    for block in blocks:
+        _check_sense(block)
+    rows = [row for block in blocks for row in block.rows]
     rates = [row.rate_rad_s for row in rows if row.rate_rad_s is not None]
     orbit = [row.orbit for row in rows if row.orbit is not None]
     return FileTruth(
-        np.array([row.unix_ns - rows[0].unix_ns for row in rows]) / NANOSECONDS,
+        np.array([date_ns - zero_ns for block in blocks for date_ns in block.dates_ns]) / NANOSECONDS,
         [row.attitude for row in rows],
         np.array(rates) if len(rates) == len(rows) else None,
         orbit if len(orbit) == len(rows) else None,
+        spans=_spans(blocks, [tuple(ns - zero_ns for ns in span) for span in spans_ns]),
         smooth=smooth,
-        start_unix_s=rows[0].unix_ns / NANOSECONDS,
+        start_unix_s=zero_ns / NANOSECONDS,
     )
 
 
-def orbit_of_rows(
-    path: Path, frame: Rotation, dates_ns: Sequence[int], rows_m: Sequence[Sequence[float]]
-) -> OrbitTable:
-    """Return the orbit of rows of x, y, z, vx, vy, vz (m, m/s) in the frame to which `frame` turns ICRS."""
-    times = np.array(dates_ns, dtype=np.float64) / NANOSECONDS
-    values = np.array(rows_m, dtype=np.float64)
-    if not len(times) or not (np.diff(times) > 0.0).all():
-        raise EmulatorError(f"orbit file {path}: has no rows, or a date is not later than the one before")
+def _check_sense(block: Block[Row]) -> None:
+    """EmulatorError if the rates of a block contradict its attitudes."""
+    check = FeedRates(timed=True)
+    for number, (date_ns, row) in enumerate(zip(block.dates_ns, block.rows, strict=True), 1):
+        try:
+            check.body_rate((date_ns - block.dates_ns[0]) / NANOSECONDS, row.attitude, row.rate_rad_s)
+        except FeedError as error:
+            fault = str(error).partition("; ")[0].replace("q,", "the quaternion,")
+            raise EmulatorError(
+                f"{block.where}, row {number}: {fault}; its sense or its frames are wrong"
+            ) from None
+
+
+def orbit_of_rows(path: Path, frame: Rotation, blocks: Sequence[Block[Sequence[float]]]) -> OrbitTable:
+    """Return the orbit of blocks of x, y, z, vx, vy, vz (m, m/s) in the frame to which `frame` turns ICRS."""
+    if not blocks:
+        raise EmulatorError(f"orbit file {path}: no rows")
+    spans_ns = _spans_ns(blocks)
+    times = np.array([date_ns for block in blocks for date_ns in block.dates_ns]) / NANOSECONDS
+    values = np.array([row for block in blocks for row in block.rows], dtype=np.float64)
     if np.abs(values).max() > MAX_METRES:
         raise EmulatorError(f"orbit file {path}: a number is outside ±{MAX_METRES:g}")
     turned = [frame.inv().apply(values[:, first : first + 3]) for first in (0, 3)]
-    return OrbitTable(path, times, [OrbitState(*pair) for pair in zip(*turned, strict=True)])
+    states = [OrbitState(*pair) for pair in zip(*turned, strict=True)]
+    for state in states:
+        doubt = doubt_of_orbit(state)
+        if doubt:
+            raise EmulatorError(f"orbit file {path}: {doubt}")
+    return OrbitTable(path, times, states, _spans(blocks, spans_ns))
+
+
+def _spans_ns(blocks: Sequence[Block[Any]]) -> list[tuple[int, int]]:
+    """Return the dates from which and to which each block holds; EmulatorError if their order is wrong."""
+    spans: list[tuple[int, int]] = []
+    for block in blocks:
+        dates = block.dates_ns
+        if any(late <= early for early, late in pairwise(dates)):
+            raise EmulatorError(f"{block.where}: a date is not later than the one before")
+        start, stop = block.usable_ns
+        begin = dates[0] if start is None else max(start, dates[0])
+        end = dates[-1] if stop is None else min(stop, dates[-1])
+        if begin > end:
+            raise EmulatorError(f"{block.where}: no row is between USEABLE_START_TIME and USEABLE_STOP_TIME")
+        if spans and begin < spans[-1][1]:
+            raise EmulatorError(
+                f"{block.where}: begins before the end of the segment before; "
+                "keep them apart by USEABLE_START_TIME and USEABLE_STOP_TIME"
+            )
+        spans.append((begin, end))
+    return spans
+
+
+def _spans(blocks: Sequence[Block[Any]], spans_ns: Sequence[Sequence[int]]) -> list[Span]:
+    """Return the spans of the rows of blocks one after the other, in seconds."""
+    firsts = [0, *accumulate(len(block.rows) for block in blocks)]
+    return [
+        Span(first, after - 1, begin / NANOSECONDS, end / NANOSECONDS)
+        for (first, after), (begin, end) in zip(pairwise(firsts), spans_ns, strict=True)
+    ]
 
 
 def euler_turns(where: str, sequence: str, angles_deg: Array) -> Rotation:

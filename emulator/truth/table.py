@@ -3,13 +3,17 @@
 `FileTruth` has times in seconds from the start of the truth, `OrbitTable` has dates. Attitudes between two rows lie
 on the shortest rotation between them; with ``smooth``, on the cubic of the rotation vector that also has the rates of
 both rows, which follows a slew with far fewer rows. Positions lie on the cubic that has both velocities.
+
+A file may have several spans of motion (`Span`). Nothing is interpolated from one to the next: in a gap between two,
+the attitude is held and flagged ``gap``, and there is no orbit.
 """
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -24,17 +28,43 @@ SMALL_TURN_RAD: Final = 1e-4
 """Turn below which the coefficient of the second order in Bortz's equation is 1/12 to the last bit."""
 
 
+@dataclass(frozen=True)
+class Span:
+    """A motion without interruption: its first and last row, and the times from which and to which it holds.
+
+    These are seconds as those of the rows, and may exclude rows that only support the interpolation.
+    """
+
+    first: int
+    last: int
+    begin_s: float
+    end_s: float
+
+    @property
+    def rows(self) -> slice:
+        """Its rows."""
+        return slice(self.first, self.last + 1)
+
+
+def span_at(spans: Sequence[Span], t: float) -> Span | None:
+    """Return the last of the spans that have begun, each no earlier than the end of the one before; None before the first."""
+    number = bisect.bisect_right(spans, t, key=lambda span: span.begin_s) - 1
+    return None if number < 0 else spans[number]
+
+
 @dataclass(frozen=True, eq=False)
 class FileTruth:
-    """Attitudes interpolated in time; at rest before the first row and after the last."""
+    """Attitudes interpolated in time; at rest before the first span, after the last, and between two."""
 
     times_s: Array
-    """Times (n,) of the rows, seconds, increasing."""
+    """Times (n,) of the rows, seconds, increasing within a span."""
     attitudes: Sequence[Attitude]
     rates_rad_s: Array | None = None
     """Body rates (n, 3), rad/s, sensor frame; None to derive them from successive rows."""
     orbit: Sequence[OrbitState] | None = None
     """Position and velocity of each row; None if the file has none."""
+    spans: Sequence[Span] = ()
+    """Spans in the order of time; by default one of all rows."""
     smooth: bool = False
     """Whether the attitude between two rows also has their rates."""
     start_unix_s: float | None = None
@@ -42,66 +72,100 @@ class FileTruth:
     start_s: float = 0.0
     """Simulation time of time zero."""
     repeat: bool = False
-    """Whether to start again after the last row."""
+    """Whether to start again after the end."""
     kind: str = "file"
 
     def __post_init__(self) -> None:
         if not len(self.attitudes):
             raise EmulatorError("truth: a truth file needs at least one row")
+        if not self.spans:
+            whole = Span(0, len(self.attitudes) - 1, float(self.times_s[0]), float(self.times_s[-1]))
+            object.__setattr__(self, "spans", (whole,))
 
     def state(self, t_s: float) -> TruthState:
         """Return the truth at a simulation time in seconds."""
-        first, last = float(self.times_s[0]), float(self.times_s[-1])
+        first, last = self.spans[0], self.spans[-1]
         t = t_s - self.start_s
-        if self.repeat and t > last > first:
-            t = first + (t - first) % (last - first)
-        if not first <= t <= last:
-            row, status = (0, TruthStatus.BEFORE_START) if t < first else (-1, TruthStatus.AFTER_END)
-            return self._row(row, ZERO_RATE, t, status)
-        if first == last:
-            return self._row(0, ZERO_RATE if self.rates_rad_s is None else self.rates_rad_s[0], t)
-        low, fraction, span = _between(self.times_s, t)
+        if self.repeat and t > last.end_s > first.begin_s:
+            t = first.begin_s + (t - first.begin_s) % (last.end_s - first.begin_s)
+        span = span_at(self.spans, t)
+        if span is None:
+            return self._held(first, first.begin_s, t, TruthStatus.BEFORE_START)
+        if t > span.end_s:
+            return self._held(span, span.end_s, t, TruthStatus.AFTER_END if span is last else TruthStatus.GAP)
+        return self._within(span, t)
+
+    def states_in(self, span: Span) -> tuple[Array, list[TruthState]]:
+        """Return the times (n,) at which a span begins, has rows and ends, and the states there."""
+        rows = self.times_s[span.rows]
+        inner = rows[(rows > span.begin_s) & (rows < span.end_s)]
+        times = np.unique([span.begin_s, *inner, span.end_s])
+        return times, [self._at(span, float(t)) for t in times]
+
+    def _held(self, span: Span, at_s: float, t: float, status: TruthStatus) -> TruthState:
+        """Return the state at one end of a span, at rest, as that of another time."""
+        return replace(self._at(span, at_s), rate_rad_s=ZERO_RATE, status=status, unix_s=self._date(t))
+
+    def _at(self, span: Span, t: float) -> TruthState:
+        """Return the state at a time within a span, which may be that of a row."""
+        row = span.first + int(np.searchsorted(self.times_s[span.rows], t))
+        return self._row(row) if self.times_s[row] == t else self._within(span, t)
+
+    def _row(self, row: int) -> TruthState:
+        rate = ZERO_RATE if self.rates_rad_s is None else self.rates_rad_s[row]
+        orbit = None if self.orbit is None else self.orbit[row]
+        return TruthState(self.attitudes[row], rate, orbit=orbit, unix_s=self._date(float(self.times_s[row])))
+
+    def _within(self, span: Span, t: float) -> TruthState:
+        """Return the state at a time within a span."""
+        if span.first == span.last:
+            return self._row(span.first)
+        low, fraction, length_s = _between(self.times_s[span.rows], t)
+        low += span.first
         before, after = self.attitudes[low], self.attitudes[low + 1]
         if self.rates_rad_s is None:
-            rate = rate_between(before, after, span)
+            rate = rate_between(before, after, length_s)
         else:
             rate = (1.0 - fraction) * self.rates_rad_s[low] + fraction * self.rates_rad_s[low + 1]
         if self.smooth and self.rates_rad_s is not None:
-            turned = _turned(before, after, self.rates_rad_s[low], self.rates_rad_s[low + 1], fraction, span)
+            turned = _turned(
+                before, after, self.rates_rad_s[low], self.rates_rad_s[low + 1], fraction, length_s
+            )
             attitude = before.rotated(turned)
         else:
             attitude = interpolate(before, after, fraction)
         orbit = None
         if self.orbit is not None:
-            orbit = interpolate_orbit(self.orbit[low], self.orbit[low + 1], fraction, span)
+            orbit = interpolate_orbit(self.orbit[low], self.orbit[low + 1], fraction, length_s)
         return TruthState(attitude, rate, orbit=orbit, unix_s=self._date(t))
-
-    def _row(self, row: int, rate: Vector, t: float, status: TruthStatus = TruthStatus.OK) -> TruthState:
-        orbit = None if self.orbit is None else self.orbit[row]
-        return TruthState(self.attitudes[row], rate, status, orbit, self._date(t))
 
     def _date(self, t: float) -> float | None:
         return None if self.start_unix_s is None else self.start_unix_s + t
 
 
 class OrbitTable:
-    """Positions and velocities of a file, interpolated between the increasing Unix times (n,) of its rows."""
+    """Positions and velocities of a file, interpolated between the Unix times (n,) of the rows of each span."""
 
-    def __init__(self, source: object, times_unix_s: Array, states: Sequence[OrbitState]) -> None:
+    def __init__(
+        self, source: object, times_unix_s: Array, states: Sequence[OrbitState], spans: Sequence[Span]
+    ) -> None:
         self._source = source
         self._times = times_unix_s
         self._states = states
+        self._spans = spans
 
     def state(self, unix_s: float) -> OrbitState:
-        """Return position and velocity at a Unix time."""
-        if not self._times[0] <= unix_s <= self._times[-1]:
+        """Return position and velocity at a Unix time; EmulatorError if it is in no span."""
+        span = span_at(self._spans, unix_s)
+        if span is None or unix_s > span.end_s:
             raise EmulatorError(
                 f"orbit file {self._source}: its dates do not include the date of the run, Unix time {unix_s:.0f}"
             )
-        if len(self._states) == 1:
-            return self._states[0]
-        low, fraction, span = _between(self._times, unix_s)
-        return interpolate_orbit(self._states[low], self._states[low + 1], fraction, span)
+        if span.first == span.last:
+            return self._states[span.first]
+        low, fraction, length_s = _between(self._times[span.rows], unix_s)
+        low += span.first
+        return interpolate_orbit(self._states[low], self._states[low + 1], fraction, length_s)
 
 
 def _between(times: Array, t: float) -> tuple[int, float, float]:

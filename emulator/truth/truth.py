@@ -33,6 +33,8 @@ class TruthHost:
     clock: Clock
     clock_name: str
     """Configured clock: that of a replay differs."""
+    start_unix_s: float
+    """Date at which the run starts."""
     time_passes: asyncio.Event
     """Set when every pipeline is ready."""
     step: Step
@@ -112,7 +114,7 @@ class Truth:
             source = replace(source, start_s=host.now_s())  # reading has taken time
         if not isinstance(config, FeedConfig) or not isinstance(source, LiveTruth):
             return source, config, None, ""
-        source.set_clock_speed(make_clock(host.clock_name).speed)
+        source.set_run(make_clock(host.clock_name).speed, host.start_unix_s)
         feed = LiveFeed(
             source, host.now_s, host.step if self._is_lockstep(config) else None, self._message_received
         )

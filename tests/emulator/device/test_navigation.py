@@ -8,7 +8,8 @@ import pytest
 from starhil.emulator.device.navigation import known_orbit
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
-from starhil.emulator.truth.orbit import KeplerOrbit
+from starhil.emulator.truth.orbit import KeplerOrbit, OrbitState
+from starhil.emulator.truth.table import OrbitTable, Span
 from starhil.protocol.messages import ErrorCode
 from starid.earth import earth_velocity
 
@@ -115,6 +116,17 @@ def test_a_run_continues_after_its_orbit_has_decayed(make_bench, caplog):
     assert [frame.truth.orbit for frame in bench.pipeline.frames] == [None] * len(bench.pipeline.frames)
     assert len(bench.pipeline.frames) >= 2
     assert caplog.text.count("has decayed; the run continues without an orbit") == 1
+
+
+def test_after_a_gap_of_an_orbit_file_the_run_has_its_orbit_again(make_bench, caplog):
+    bench = make_bench(Profile()).start()
+    surroundings, start = bench.device.surroundings, bench.device.surroundings._start_unix_s
+    place = OrbitState(np.array([7e6, 0.0, 0.0]), np.array([0.0, 7.5e3, 0.0]))
+    spans = [Span(0, 0, start, start + 10.0), Span(1, 1, start + 20.0, start + 30.0)]
+    surroundings._orbit = OrbitTable("orbit.oem", np.array([start, start + 20.0]), [place] * 2, spans)
+    has_orbit = [surroundings.state(second * 10**9).orbit is place for second in (5, 12, 15, 25, 35)]
+    assert has_orbit == [True, False, False, True, False]
+    assert caplog.text.count("the run continues without an orbit") == 2  # once for each gap
 
 
 def test_an_invalid_orbit_in_a_profile_names_the_profile(make_bench):

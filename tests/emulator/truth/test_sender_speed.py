@@ -34,7 +34,7 @@ def warnings(caplog):
 @pytest.mark.parametrize("speed", [0.1, 0.5, 1.5, 3.0, 100.0])
 def test_a_sender_at_another_speed_is_named_within_a_few_messages_and_followed(speed, clock_speed, caplog):
     live = LiveTruth(START, stale_s=10.0)
-    live.set_clock_speed(clock_speed)
+    live.set_run(clock_speed, 0.0)
     period_s = 0.1 * clock_speed  # of simulation time; 0.1 s of wall time
     rng = np.random.default_rng(1)
     for n in range(100):
@@ -121,7 +121,7 @@ def test_a_measured_speed_is_named_as_a_whole_one_if_it_is_near(measured, named)
 
 def test_only_a_sender_with_times_on_a_clock_that_passes_by_itself_has_a_speed(caplog):
     untimed, stepped = LiveTruth(START), LiveTruth(START)
-    stepped.set_clock_speed(0.0)
+    stepped.set_run(0.0, 0.0)
     for n in range(50):
         send(untimed, 0.3 * n, 0.1 * n, timed=False)
         send(stepped, 0.3 * n, 0.1 * n)

@@ -366,7 +366,7 @@ def test_a_quaternion_in_the_wrong_sense_is_rejected_by_its_rates(tmp_path: Path
         date, x, y, z, *rest = row.split()
         wrong.append(" ".join((date, *(repr(-float(v)) for v in (x, y, z)), *rest)))
     with pytest.raises(
-        EmulatorError, match=r"block 1, row \d+: rate contradicts the quaternion, .* sense or its frames"
+        EmulatorError, match=r"segment 1, row \d+: rate contradicts the quaternion, .* sense or its frames"
     ):
         read_truth_file(write(tmp_path, aem(rows=wrong)))
     q, rate = SHUSTER[0], np.array([0.0, 0.1, 0.0])
