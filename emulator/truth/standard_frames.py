@@ -51,18 +51,18 @@ class Row:
     orbit: OrbitState | None = None
 
 
-T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass(frozen=True)
-class Block(Generic[T]):
+class Block(Generic[T_co]):
     """Rows of a motion without interruption, with their dates, at least one."""
 
     where: str
     """File and segment, for messages."""
     dates_ns: Sequence[int]
     """Unix times, nanoseconds."""
-    rows: Sequence[T]
+    rows: Sequence[T_co]
     usable_ns: tuple[int | None, int | None] = (None, None)
     """Dates from which and to which the block holds, if some rows only support the interpolation."""
 
