@@ -176,7 +176,8 @@ _quantity("attitude.stable", int, "", "Valid attitudes in a row, up to the last 
           lambda shot: shot.device.valid_in_a_row)
 _named("attitude.reason", "attitude_reason", "Why the attitude is invalid, `ok` if it is valid.",
        lambda shot: str(shot.reported.reason))
-_solution("attitude.sigma_cross", "arcsec", "One sigma about an axis across the boresight, with known errors of the calibration",
+_solution("attitude.sigma_cross", "arcsec", "One sigma about an axis across the boresight, with known errors of the calibration, "
+          "which change with the attitude and not from frame to frame",
           lambda frame: float(frame.result.sigma_cross_arcsec))
 _solution("attitude.sigma_roll", "arcsec", "One sigma about the boresight, with known errors of the calibration",
           lambda frame: float(frame.result.sigma_roll_arcsec))

@@ -269,8 +269,8 @@ class FileConfig(SourceConfig):
     path: UserPath
     """The file; its content says which format it has, see truth-files.md."""
     start: Literal["run", "now"] = "run"
-    """Time zero of the file, which is the first row of a file with dates: the start of the run, or the time at which
-    the truth is set."""
+    """Time zero of the file, which is the first useable date of a file with dates: the start of the run, or the time at
+    which the truth is set."""
     repeat: bool = False
     """Whether to start again after the last row."""
 

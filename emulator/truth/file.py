@@ -9,7 +9,7 @@ SPICE            ``KPL/MK``, a meta-kernel                                      
 CSV              anything else                                                       `csv_file`
 ===============  ==================================================================  =================
 
-The first row of a file with dates is its time zero. Messages about CSV do not quote the file, because a client of the
+The first useable date of a file is its time zero. Messages about CSV do not quote the file, because a client of the
 control channel may name files that it must not read; those about the others quote only names of frames and formats.
 """
 
