@@ -11,6 +11,7 @@ each interval for which the CK has attitudes. Segments of type 1 have none betwe
 
 from __future__ import annotations
 
+import math
 import threading
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
@@ -44,6 +45,9 @@ NEEDS_RATES: Final = False
 
 MAX_INTERVALS: Final = 200_000
 """Largest number of intervals of a CK."""
+
+MAX_NAME: Final = 79
+"""Longest name of a meta-kernel, such that the longest of the others fits into the 80 characters of a text in SPICE."""
 
 TICKS_PER_S: Final = 1_000_000
 """Resolution of the clock of a written CK."""
@@ -151,6 +155,7 @@ def _blocks(spice: Any, path: Path, kernel: str, structure: int) -> Iterator[Blo
     finally:
         spice.dafcls(handle)
     # SPICE has one search at a time, which reading attitudes would end
+    last_that_begins = {begin: number for number, (begin, *_) in enumerate(segments, 1)}
     for number, (begin, end, has_rates, records) in enumerate(segments, 1):
         low = bisect_left(intervals, begin, key=lambda interval: interval[1])
         high = bisect_right(intervals, end, key=lambda interval: interval[0])
@@ -159,10 +164,12 @@ def _blocks(spice: Any, path: Path, kernel: str, structure: int) -> Iterator[Blo
                 ticks = _steps(spice, structure, first, last)
             else:
                 ticks = records[bisect_left(records, first) : bisect_right(records, last)]
+            dates_ns = [_unix_ns(spice, structure, tick) for tick in ticks]
+            if len(ticks) > 1 and last_that_begins.get(ticks[-1], 0) > number:
+                ticks[-1] = math.nextafter(ticks[-1], ticks[0])  # SPICE prefers the later segment
             rows = [_row(spice, structure, tick, has_rates=has_rates) for tick in ticks]
-            where = f"truth file {path}, segment {number}"
             if rows:
-                yield Block(where, [at_ns for at_ns, _ in rows], [row for _, row in rows])
+                yield Block(f"truth file {path}, segment {number}", dates_ns, rows)
 
 
 def _steps(spice: Any, structure: int, first: float, last: float) -> list[float]:
@@ -174,20 +181,25 @@ def _steps(spice: Any, structure: int, first: float, last: float) -> list[float]
     return [first, *inner, *([last] if last > first else ())]
 
 
-def _row(spice: Any, structure: int, tick: float, *, has_rates: bool) -> tuple[int, Row]:
-    """Return the date of a tick as Unix time, nanoseconds, and what SPICE has there."""
+def _unix_ns(spice: Any, structure: int, tick: float) -> int:
+    """Return the date of a tick as Unix time, nanoseconds."""
+    et = spice.sct2e(spice.ckmeta(structure, "SCLK"), tick)
+    return round((et - spice.deltet(et, "ET") + J2000_UNIX_S) * NANOSECONDS)
+
+
+def _row(spice: Any, structure: int, tick: float, *, has_rates: bool) -> Row:
+    """Return what SPICE has at a tick."""
     rate, orbit = None, None
     if has_rates:
         matrix, rate, _ = spice.ckgpav(structure, tick, 0.0, "J2000")
         rate = matrix @ rate
     else:
         matrix, _ = spice.ckgp(structure, tick, 0.0, "J2000")
-    et = spice.sct2e(spice.ckmeta(structure, "SCLK"), tick)
     if spice.ktotal("SPK"):
+        et = spice.sct2e(spice.ckmeta(structure, "SCLK"), tick)
         state, _ = spice.spkez(spice.ckmeta(structure, "SPK"), et, "J2000", "NONE", EARTH)
         orbit = OrbitState(1e3 * state[:3], 1e3 * state[3:])
-    unix_s = et - spice.deltet(et, "ET") + J2000_UNIX_S
-    return round(unix_s * NANOSECONDS), Row(Attitude.from_matrix(matrix), rate, orbit)
+    return Row(Attitude.from_matrix(matrix), rate, orbit)
 
 
 def write_kernels(truth: FileTruth, path: Path, structure: int) -> None:
@@ -201,6 +213,10 @@ def write_kernels(truth: FileTruth, path: Path, structure: int) -> None:
         Number of the sensor in the CK, at most -1000; that of the spacecraft and its clock is a thousandth of it.
     """
     spice = load_spice()
+    if not path.name.isascii() or len(path.name) > MAX_NAME:
+        raise EmulatorError(
+            f"{path}: SPICE cannot read a file of this name; give one of at most {MAX_NAME} ASCII characters"
+        )
     files = {suffix: path.with_suffix(suffix) for suffix in (".tls", ".tsc", ".bc")}
     has_rates = truth.rates_rad_s is not None
     with _kernels(spice, path):
@@ -226,7 +242,7 @@ def write_kernels(truth: FileTruth, path: Path, structure: int) -> None:
                 len(ticks), ticks, [spice.m2q(matrix) for matrix in matrices], rates, 1, ticks[:1],
             )  # fmt: skip
         spice.ckcls(handle)
-        names = ", ".join(f"'{file.name}'" for file in files.values())
+        names = ",\n".join("'" + file.name.replace("'", "''") + "'" for file in files.values())
         path.write_text(META.format(names), encoding="ascii")
 
 

@@ -176,8 +176,8 @@ def _spans_ns(blocks: Sequence[Block[Any]]) -> list[tuple[int, int]]:
             raise EmulatorError(f"{block.where}: no row is between USEABLE_START_TIME and USEABLE_STOP_TIME")
         if spans and begin < spans[-1][1]:
             raise EmulatorError(
-                f"{block.where}: begins before the end of the segment before; "
-                "keep them apart by USEABLE_START_TIME and USEABLE_STOP_TIME"
+                f"{block.where}: overlaps the segment before; "
+                "in a CCSDS file, USEABLE_START_TIME and USEABLE_STOP_TIME keep them apart"
             )
         spans.append((begin, end))
     return spans

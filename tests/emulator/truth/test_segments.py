@@ -97,11 +97,11 @@ def test_the_first_useable_time_is_time_zero_and_after_the_last_the_attitude_is_
     [
         (
             ({}, {}),
-            "segment 2: begins before the end of the segment before; keep them apart by USEABLE_START_TIME",
+            "segment 2: overlaps the segment before; in a CCSDS file, USEABLE_START_TIME and USEABLE_STOP_TIME keep them apart",
         ),
         (
             ({"USEABLE_STOP_TIME": date(18)}, {"USEABLE_START_TIME": date(17)}),
-            "segment 2: begins before the end of the segment before",
+            "segment 2: overlaps the segment before",
         ),
         (({"USEABLE_STOP_TIME": date(18)}, {"USEABLE_START_TIME": "18"}), "segment 2: not a date"),
         (
@@ -152,16 +152,24 @@ def test_a_converted_file_has_the_gap_too(tmp_path: Path, monkeypatch: pytest.Mo
     check_gap(read_truth_file(Path(name)))
 
 
-def test_converted_segments_that_overlap_keep_their_useable_spans(tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["out.aem", "out.tm"])
+def test_converted_segments_that_overlap_keep_their_useable_spans(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """In a CK, the later of two segments that share a time has precedence there."""
+    if name.endswith(".tm"):
+        needs("spiceypy")
+    monkeypatch.chdir(tmp_path)
     parts = (
         segment(BEFORE, range(21), USEABLE_STOP_TIME=date(17.5)),
         segment(AFTER, range(15, 41), USEABLE_START_TIME=date(17.5)),
     )
-    target = tmp_path / "out.aem"
-    assert run_command_line("truth", "convert", str(write(tmp_path, *parts)), "-o", str(target))[0] == 0
-    truth = read_truth_file(target)
+    assert run_command_line("truth", "convert", str(write(tmp_path, *parts)), "-o", name) == (0, "", "")
+    truth = read_truth_file(Path(name))
+    assert off_arcsec(truth, 17.3, BEFORE) < MILLIARCSECOND
     assert off_arcsec(truth, 17.4999, BEFORE) < MILLIARCSECOND
-    assert off_arcsec(truth, 17.5, AFTER) < MILLIARCSECOND
+    assert off_arcsec(truth, 17.5001, AFTER) < MILLIARCSECOND
+    assert {truth.state(t).status for t in (17.4999, 17.5, 17.5001)} == {TruthStatus.OK}
 
 
 def test_a_repeated_file_repeats_its_gap(tmp_path: Path) -> None:
@@ -349,6 +357,29 @@ def test_what_spice_does_not_find_is_an_error_of_the_file(
     with pytest.raises(EmulatorError) as error:
         read_truth_file(Path("out.tm"))
     assert str(error.value) == "out.tm: SPICE: Spice returns not found for function: ckgpav"
+
+
+@pytest.mark.parametrize("name", ["it's.tm", 76 * "x" + ".tm"])
+def test_a_ck_of_any_name_that_spice_can_read_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    needs("spiceypy")
+    monkeypatch.chdir(tmp_path)
+    assert run_command_line("truth", "convert", str(two_segments(tmp_path)), "-o", name) == (0, "", "")
+    check_gap(read_truth_file(Path(name)))
+
+
+@pytest.mark.parametrize("name", ["ö.tm", 77 * "x" + ".tm"])
+def test_a_name_that_spice_cannot_read_is_rejected_before_anything_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    needs("spiceypy")
+    monkeypatch.chdir(tmp_path)
+    source = two_segments(tmp_path)
+    status, _, said = run_command_line("truth", "convert", str(source), "-o", name)
+    assert status == 2
+    assert said.endswith("SPICE cannot read a file of this name; give one of at most 79 ASCII characters\n")
+    assert list(tmp_path.iterdir()) == [source]
 
 
 @pytest.mark.parametrize("kind", [2, 3])

@@ -280,7 +280,7 @@ def test_a_ck_without_its_clock_names_what_spice_lacks(
     needs("spiceypy")
     monkeypatch.chdir(tmp_path)
     run_command_line("truth", "convert", str(write(tmp_path, aem())), "-o", "out.tm")
-    Path("bare.tm").write_text(Path("out.tm").read_text().replace("'out.tsc', ", ""))
+    Path("bare.tm").write_text(Path("out.tm").read_text().replace("'out.tsc',\n", ""))
     with pytest.raises(EmulatorError, match=r"SPICE: .*SCLK"):
         read_truth_file(Path("bare.tm"))
 
