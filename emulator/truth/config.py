@@ -11,11 +11,13 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.feed import Socket
 from starhil.emulator.truth.feed_message import JsonFormat
 from starhil.emulator.truth.file import read_orbit_file, read_truth_file
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.orbit import LARGEST_ECCENTRICITY, KeplerOrbit, Orbit, OrbitState, TleOrbit
+from starhil.emulator.truth.plausibility import doubt_of_orbit
 from starhil.emulator.truth.simulator_42 import Format42
 from starhil.emulator.truth.source import (
     MAX_RATE_DEG_S,
@@ -424,6 +426,9 @@ class StateConfig(Strict):
     def build(self, start_unix_s: float, folder: Path) -> Orbit:  # noqa: ARG002 (one signature for all)
         """Make the orbit for a run that starts at a Unix time."""
         state = OrbitState(np.array(self.position_m), np.array(self.velocity_m_s))
+        doubt = doubt_of_orbit(state)
+        if doubt:
+            raise EmulatorError(f"orbit: {doubt}")
         return KeplerOrbit.from_state(start_unix_s if self.date is None else self.date, state, j2=self.j2)
 
 

@@ -184,7 +184,8 @@ def _steps(spice: Any, structure: int, first: float, last: float) -> list[float]
 def _unix_ns(spice: Any, structure: int, tick: float) -> int:
     """Return the date of a tick as Unix time, nanoseconds."""
     et = spice.sct2e(spice.ckmeta(structure, "SCLK"), tick)
-    return round((et - spice.deltet(et, "ET") + J2000_UNIX_S) * NANOSECONDS)
+    unix_s = float(et - spice.deltet(et, "ET") + J2000_UNIX_S)
+    return round(unix_s * NANOSECONDS)
 
 
 def _row(spice: Any, structure: int, tick: float, *, has_rates: bool) -> Row:

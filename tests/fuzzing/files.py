@@ -21,7 +21,7 @@ from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.replay import EVENTS_FILE, RUN_FILE, read_events, read_run
 from starhil.emulator.truth.ccsds_file import write_aem
 from starhil.emulator.truth.file import read_truth_file
-from starhil.emulator.truth.table import FileTruth
+from starhil.emulator.truth.table import FileTruth, Span
 from starhil.hil_tests.images import decode_bmp
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.truth_log import TruthLogReader
@@ -165,11 +165,14 @@ LOG = "time_of_exposure_s,true_qx,true_qy,true_qz,true_qw\n0,0,0,0,1\n1,0,0,0.1,
 
 
 def standard_truths() -> list[bytes]:
-    """Return an AEM as KVN and XML, and an attitude file of STK."""
-    file = FileTruth(np.array([0.0, 10.0]), [Attitude.identity()] * 2, np.zeros((2, 3)), start_unix_s=1.7e9)
+    """Return an AEM of two segments as KVN, one as XML, and an attitude file of STK with a segment boundary."""
+    spans = [Span(0, 1, 0.0, 9.0), Span(2, 3, 9.0, 20.0)]
+    times = np.array([0.0, 10.0, 8.0, 20.0])
+    file = FileTruth(times, [Attitude.identity()] * 4, np.zeros((4, 3)), spans=spans, start_unix_s=1.7e9)
     stk = (
         "stk.v.11.0\nBEGIN Attitude\nScenarioEpoch 1 Jan 2026 00:00:00.0\nCoordinateAxes ICRF\n"
-        "AttitudeTimeQuatAngVels\n0 0 0 0 1 0 0 0.1\n1e1 0 0 0.00872654 0.99996192 0 0 0.1\nEND Attitude\n"
+        "BEGIN SegmentBoundaryTimes\n0.0\n5.0\nEND SegmentBoundaryTimes\nAttitudeTimeQuatAngVels\n"
+        "0 0 0 0 1 0 0 0.1\n1e1 0 0 0.00872654 0.99996192 0 0 0.1\nEND Attitude\n"
     )
     xml = (
         '<aem id="CCSDS_AEM_VERS" version="2.0"><body><segment><metadata><REF_FRAME_A>ICRF</REF_FRAME_A>'

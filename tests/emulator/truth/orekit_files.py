@@ -2,6 +2,7 @@
 
 `orekit_files.py write FOLDER`: AEMs of versions 1 and 2, as KVN and XML, of the rows in FOLDER/rows.json.
 `orekit_files.py read FILE`: the matrices ICRS→body and rates of an AEM, one row per line, as JSON.
+`orekit_files.py ephemeris FILE START T …`: position and velocity, m, m/s, by an STK ephemeris at seconds from a date, as JSON lines.
 """
 
 import json
@@ -15,7 +16,7 @@ import orekit_jpype
 orekit_jpype.initVM()
 
 from java.io import File, StringWriter
-from java.util import ArrayList
+from java.util import ArrayList, HashMap
 from org.hipparchus.geometry.euclidean.threed import Rotation, Vector3D
 from org.orekit.data import DataContext, DataSource, DirectoryCrawler
 from org.orekit.files.ccsds.definitions import FrameFacade, TimeSystem
@@ -23,6 +24,7 @@ from org.orekit.files.ccsds.ndm import ParserBuilder, WriterBuilder
 from org.orekit.files.ccsds.ndm.adm import AdmHeader, AttitudeType
 from org.orekit.files.ccsds.ndm.adm.aem import Aem, AemData, AemMetadata, AemSegment
 from org.orekit.files.ccsds.utils.generation import KvnGenerator, XmlGenerator
+from org.orekit.files.stk import STKEphemerisFile, STKEphemerisFileParser
 from org.orekit.frames import FramesFactory
 from org.orekit.time import AbsoluteDate, TimeScalesFactory
 from org.orekit.utils import IERSConventions, TimeStampedAngularCoordinates
@@ -102,6 +104,21 @@ def read(path: Path) -> None:
             print(json.dumps({"date": date, "matrix": matrix, "rate": rate}))
 
 
+def ephemeris(path: Path) -> None:
+    """Of two segments that share a time, the later one holds."""
+    utc, gcrf = TimeScalesFactory.getUTC(), FramesFactory.getGCRF()
+    frames = HashMap()
+    frames.put(STKEphemerisFile.STKCoordinateSystem.ICRF, gcrf)
+    parser = STKEphemerisFileParser("x", 3.986004418e14, utc, frames)
+    segments = list(parser.parse(DataSource(str(path))).getSatellites().get("x").getSegments())
+    epoch = AbsoluteDate(sys.argv[3], utc)
+    for t in map(float, sys.argv[4:]):
+        date = epoch.shiftedBy(t)
+        segment = [each for each in segments if each.getStart().compareTo(date) <= 0][-1]
+        state = segment.getPropagator().getPVCoordinates(date, gcrf)
+        print(json.dumps([float(x) for v in (state.getPosition(), state.getVelocity()) for x in v.toArray()]))
+
+
 what, path = sys.argv[1], Path(sys.argv[2])
 leap_seconds(path if path.is_dir() else path.parent)
-(write if what == "write" else read)(path)
+{"write": write, "read": read, "ephemeris": ephemeris}[what](path)

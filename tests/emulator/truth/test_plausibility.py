@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth.config import StateConfig
 from starhil.emulator.truth.file import read_orbit_file, read_truth_file
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.orbit import OrbitState
@@ -162,6 +163,28 @@ def test_positions_of_a_truth_file_in_wrong_units_are_named_by_line(tmp_path: Pa
     assert str(error.value) == (
         f"truth file {path} line 2: position and velocity seem to be in kilometres instead of metres"
     )
+
+
+@pytest.mark.parametrize(
+    ("position", "velocity", "said"),
+    [
+        (
+            [7.2e3, 0.0, 0.0],
+            [0.0, 7.44, 0.0],
+            "position and velocity seem to be in kilometres instead of metres",
+        ),
+        (
+            [7.2e6, 0.0, 0.0],
+            [0.0, 7.44, 0.0],
+            "velocity seems to be in kilometres per second instead of metres per second",
+        ),
+    ],
+)
+def test_a_state_of_a_profile_in_wrong_units_is_named(position, velocity, said: str, tmp_path: Path) -> None:
+    config = StateConfig(kind="state", position_m=position, velocity_m_s=velocity)
+    with pytest.raises(EmulatorError) as error:
+        config.build(RUN, tmp_path)
+    assert str(error.value) == f"orbit: {said}"
 
 
 def test_the_status_shows_a_feed_of_another_date(run) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from starhil.emulator.truth.spice_file import write_kernels
 from starid.attitude import Attitude, propagate
 from starid.earth import unix_time
 from tests.emulator.cli.command_line import run_command_line
-from tests.emulator.truth.test_standard_files import needs
+from tests.emulator.truth.test_standard_files import needs, run_orekit
 
 START_UNIX_S = unix_time("2026-03-20T12:00:00Z")
 MILLIARCSECOND = 1e-3
@@ -255,25 +257,42 @@ def circle(t: float, sense: float = 1.0) -> list[float]:
     return [7e6 * cosine, 7e6 * sine, 0.0, -7e3 * math.sin(1e-3 * t), sense * 7e3 * cosine, 0.0]
 
 
-def test_an_ephemeris_of_stk_with_a_manoeuvre_has_both_velocities_at_the_boundary(tmp_path: Path) -> None:
+def manoeuvre(tmp_path: Path) -> Path:
+    """An ephemeris of STK with two rows at its epoch, at which the motion turns back."""
     path = tmp_path / "orbit.e"
-    times = [*range(-300, 1, 60)], [*range(0, 301, 60)]
-    rows = [
-        " ".join(map(repr, (t, *circle(t, sense))))
-        for part, sense in zip(times, (1.0, -1.0), strict=True)
-        for t in part
-    ]
+    rows = [(t, 1.0) for t in range(-300, 1, 30)] + [(t, -1.0) for t in range(0, 301, 30)]
     path.write_text(
         "stk.v.12.0\nBEGIN Ephemeris\nScenarioEpoch 20 Mar 2026 12:00:00.000\nCoordinateSystem ICRF\n"
         "BEGIN SegmentBoundaryTimes\n-3.0e+02\n0.0\nEND SegmentBoundaryTimes\nEphemerisTimePosVel\n"
-        + "\n".join(rows)
+        + "\n".join(" ".join(map(repr, (float(t), *circle(t, sense)))) for t, sense in rows)
         + "\nEND Ephemeris\n"
     )
+    return path
+
+
+AROUND_IT = (-200.0, -30.0, -0.01, 0.0, 30.0, 299.0)
+
+
+def test_an_ephemeris_of_stk_with_a_manoeuvre_has_both_velocities_at_the_boundary(tmp_path: Path) -> None:
+    orbit = read_orbit_file(manoeuvre(tmp_path))
+    for t in AROUND_IT:
+        state, expected = orbit.state(START_UNIX_S + t), circle(t, 1.0 if t < 0.0 else -1.0)
+        assert state.position_m == pytest.approx(expected[:3], abs=0.02)
+        assert state.velocity_m_s == pytest.approx(expected[3:], abs=0.003)
+
+
+@pytest.mark.process
+def test_orekit_reads_the_same_from_an_ephemeris_with_a_manoeuvre(tmp_path: Path) -> None:
+    needs("orekit_jpype")
+    if shutil.which("java") is None:
+        pytest.skip("no java here (Debian package default-jre-headless)")
+    path = manoeuvre(tmp_path)
+    lines = run_orekit("ephemeris", path, "2026-03-20T12:00:00", *AROUND_IT).splitlines()
     orbit = read_orbit_file(path)
-    for t, sense in ((-30.0, 1.0), (-0.01, 1.0), (0.0, -1.0), (30.0, -1.0)):
-        state = orbit.state(START_UNIX_S + t)
-        assert state.position_m == pytest.approx(circle(t, sense)[:3], abs=0.3)
-        assert state.velocity_m_s == pytest.approx(circle(t, sense)[3:], abs=0.02)
+    for t, line in zip(AROUND_IT, lines, strict=True):
+        numbers, state = json.loads(line), orbit.state(START_UNIX_S + t)
+        assert state.position_m == pytest.approx(numbers[:3], abs=0.02)
+        assert state.velocity_m_s == pytest.approx(numbers[3:], abs=0.003)
 
 
 # --- OEM ---
