@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
@@ -55,8 +56,12 @@ def _check_field(field: Field, row: Row, action: ActionModel | None, icd: Interf
         raise IcdError("sets nothing; bind it to a parameter with `parameter`, or leave out its name")
 
 
+SELECTING: Final = frozenset({"subscribe", "select_unsolicited"})
+"""Actions that select rows to be sent unsolicited."""
+
+
 def unbound(icd: InterfaceDefinition) -> list[str]:
-    """Return an error message for each row or field that the device cannot serve, because it has no binding."""
+    """Return an error message for each row or field that the device cannot serve, because nothing gives it a value or sends it."""
     missing = [
         f"{icd.files[row.name]}: telecommand {row.name}: no `action`; use `nothing` to accept the telecommand without effect"
         for row in icd.telecommands.values()
@@ -70,6 +75,14 @@ def unbound(icd: InterfaceDefinition) -> list[str]:
         for field in row.named_fields.values()
         if (field.value, field.const, field.parameter, field.default, field.telecommand) == (None,) * 5
     ]
+    if not any(row.action in SELECTING or row.action in icd.plugin.actions for row in icd.rows):
+        answers = {answer for row in icd.rows for answer in row.answers}
+        missing += [
+            f"{icd.files[row.name]}: telemetry {row.name}: `request = false`, but nothing sends it; add `unsolicited`, "
+            f"or 'row:{row.name}' to the `answer` of another row"
+            for row in icd.telemetry.values()
+            if row.only_sent and row.unsolicited is None and f"row:{row.name}" not in answers
+        ]
     return missing
 
 
