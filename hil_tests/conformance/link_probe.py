@@ -6,7 +6,8 @@ The judge (`starhil.hil_tests.judge`) encodes and decodes; a probe adds the port
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Protocol
@@ -171,6 +172,11 @@ class LinkProbe(Probe):
     @abstractmethod
     def _unsolicited_answers(self) -> list[Answer]:
         """Return the messages in `unsolicited`."""
+
+    @contextmanager
+    def streaming(self, rows: Iterable[Row]) -> Iterator[None]:  # noqa: ARG002 -- where messages say it themselves
+        """Take messages of these rows that no request awaits for unsolicited telemetry."""
+        yield
 
     def check_numbers(self, answers: Sequence[Answer]) -> None:
         """Fail the case unless the numbers that the unit has given successive messages are successive."""

@@ -393,6 +393,12 @@ def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
 
 
 def _subscribed(command: Row, fields: list[str], offered: list[Row], probe: LinkProbe) -> None:
+    _check_carried(probe)
+    with probe.streaming(offered):
+        _subscribe(command, fields, offered, probe)
+
+
+def _subscribe(command: Row, fields: list[str], offered: list[Row], probe: LinkProbe) -> None:
     none = dict.fromkeys(fields, 0)
 
     def of_list(seconds: float) -> list[Answer]:

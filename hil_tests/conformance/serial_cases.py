@@ -22,7 +22,7 @@ from starhil.hil_tests.conformance.case import (
     rule,
 )
 from starhil.hil_tests.conformance.case_file import CUBESPACE_CASES, text_cases
-from starhil.hil_tests.conformance.link_probe import INVALID_ID, lively_row
+from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH, lively_row
 from starhil.hil_tests.conformance.row_cases import CLOCK_S, row_cases
 from starhil.hil_tests.conformance.serial_probe import BITS_A_BYTE, SerialProbe
 from starhil.hil_tests.judge.definition import Unit
@@ -134,10 +134,14 @@ def _framing(line: SerialLine, framing: Framing, *, in_text: bool) -> Iterator[C
     def overlong(probe: SerialProbe) -> None:
         size = probe.unit.serial.max_size or max(DEFAULT_MAX_SIZE, *(row.size for row in probe.unit.rows))
         request = probe.unit.request(probe.lively)
+        envelope = probe.line.request_format(request.klass)[1]
         if in_text:
             probe.send(framing.encode(_body(probe) + plain[:1] * (size + 64)))
-        else:
+        elif size + 64 in envelope.data_sizes(request.klass):
             probe.send(probe.line.encode(replace(request, data=plain[:1] * (size + 64))))
+        else:  # the longest message that its length field can state is not too long, but longer than the row
+            longest = envelope.data_sizes(request.klass)[-1]
+            probe.expect_refusal(probe.lively, plain[:1] * longest, INVALID_LENGTH)
         probe.expect_silence("the message was too long")
         probe.sleep_past_timeout()
         probe.expect_alive()
@@ -304,7 +308,7 @@ def _silent_header(envelope: Headed, name: str, item: Any, values: list[int], wh
         header = _body(probe)[: envelope.requests.size(klass)]
         offset, size = envelope.requests.place(item, klass)
         for value in values:
-            piece = value.to_bytes(size, item.order or probe.unit.conventions.byte_order)
+            piece = (value % (1 << 8 * size)).to_bytes(size, item.order or probe.unit.conventions.byte_order)
             changed = header[:offset] + piece + header[offset + size :]
             probe.send(probe.line.request_format(klass)[0].encode(envelope.closed(changed, b"")))
         probe.expect_silence(what)

@@ -101,6 +101,11 @@ class Unit:
         return tuple(row for table in tables for row in sorted(table.values(), key=lambda row: row.id))
 
     @cached_property
+    def readable(self) -> Mapping[str, Row]:
+        """Telemetry that a request reads, by name."""
+        return {name: row for name, row in self.telemetry.items() if not row.only_sent}
+
+    @cached_property
     def parameters_by_id(self) -> Mapping[int, Parameter]:
         """Parameters that the unit exposes, by ID."""
         return {item.id: item for item in self.parameters.values()}
@@ -214,7 +219,7 @@ def _parameter(item: Any) -> Parameter:
 def _row(row: Any, icd: InterfaceDefinition) -> Row:
     return Row(
         row.kind, row.id, row.name, tuple(_fields(row, icd)), row.klass, row.provenance, row.source, row.action, row.arguments,
-        row.answers, row.request, row.unsolicited,
+        row.answers, row.request, row.unsolicited, row.only_sent,
     )  # fmt: skip
 
 
