@@ -49,20 +49,30 @@ PUBLISHED_IDS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc,
 Run = Callable[[LinkProbe], None]
 
 
+ANY_SIZE: Final = range(1 << 16)
+
+
 def row_cases(
-    unit: Unit, *, lengths: bool = True, numbers: bool = True, marks: bytes = b"", highest_id: int = 255
+    unit: Unit,
+    *,
+    lengths: bool = True,
+    numbers: bool = True,
+    marks: bytes = b"",
+    highest_id: int = 255,
+    sizes: Callable[[str], range] = lambda _klass: ANY_SIZE,
 ) -> Iterator[Case[LinkProbe]]:
     """Yield the cases for the rows of a unit.
 
     `lengths`: whether a message of a wrong length can be sent on the link. `numbers`: whether requests carry IDs. `marks`: bytes that are special on it, of which settings
-    are made. `highest_id`: the highest that a message can carry.
+    are made. `highest_id`: the highest that a message can carry. `sizes`: the numbers of bytes of data that a request of a class can have.
     """
     if numbers:
-        yield from _identifiers(unit, highest_id)
+        yield from _identifiers(unit, highest_id, sizes)
     if lengths:
-        yield from _lengths(unit)
+        yield from _lengths(unit, sizes)
     for row in unit.telemetry.values():
-        yield from _telemetry(unit, row)
+        if not row.only_sent or row.is_streamed:
+            yield from _telemetry(unit, row)
     for row in unit.telecommands.values():
         for index, (name, item) in enumerate(row.named.items()):
             for why, data in row.bad_values(item):
@@ -78,10 +88,24 @@ def row_cases(
     )
 
 
+def sent_cases(unit: Unit) -> Iterator[Case[LinkProbe]]:
+    """Yield the cases for a unit none of whose telemetry a request reads: those of the rows that it sends by itself."""
+    for row in unit.telemetry.values():
+        if row.is_streamed:
+            yield from _telemetry(unit, row)
+    yield from _unsolicited(unit)
+
+    def requests(_probe: LinkProbe) -> None:
+        raise CaseSkipped("no request reads a row, so that no case can see whether a request was taken")
+
+    title = "framing, check, header, IDs, lengths and values of requests"
+    yield case_in("unjudged", "requests", title, requests, "[[telemetry]]: `request = false` in all rows")
+
+
 # --- row IDs ---
 
 
-def _identifiers(unit: Unit, highest: int) -> Iterator[Case[LinkProbe]]:
+def _identifiers(unit: Unit, highest: int, sizes: Callable[[str], range]) -> Iterator[Case[LinkProbe]]:
     """Yield a case for each class, or for each kind where IDs tell them apart."""
     groups: dict[str, tuple[str, range]] = {
         item.name: (item.name, range(highest + 1)) for item in unit.classes if item.code is not None
@@ -90,7 +114,7 @@ def _identifiers(unit: Unit, highest: int) -> Iterator[Case[LinkProbe]]:
         first = unit.first_telemetry_id
         groups = {"telemetry": ("", range(first, highest + 1)), "telecommands": ("", range(first))}
     for name, (klass, numbers) in (groups or {"unknown": ("", range(highest + 1))}).items():
-        known = {row.id for row in unit.rows if row.klass == klass or not klass}
+        known = {row.id for row in unit.rows if not row.only_sent and (row.klass == klass or not klass)}
         unknown = [number for number in numbers if number not in known]
         if klass:  # every class has all numbers: those beside its rows, and both ends
             near = {row_id + step for row_id in known for step in (-1, 1)} | {0, highest}
@@ -98,15 +122,15 @@ def _identifiers(unit: Unit, highest: int) -> Iterator[Case[LinkProbe]]:
 
         def run(probe: LinkProbe, klass: str = klass, unknown: list[int] = unknown) -> None:
             for row_id in unknown:
-                probe.expect_refusal(row_id, b"", INVALID_ID, klass)
+                probe.expect_refusal(row_id, bytes(sizes(klass)[0]), INVALID_ID, klass)
 
         title = f"unknown {'IDs of class ' + klass if klass else 'IDs' if name == 'unknown' else name} are refused"
         yield case_in("identifiers", name, title, run, PUBLISHED_IDS, intrusive=name != "telemetry")
 
 
-def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
+def _lengths(unit: Unit, sizes: Callable[[str], range]) -> Iterator[Case[LinkProbe]]:
     def with_data(probe: LinkProbe) -> None:
-        for row in probe.unit.telemetry.values():
+        for row in probe.unit.readable.values():
             if probe.distinguishes_refusal(row):
                 probe.expect_refusal(row, b"\x00", INVALID_LENGTH)
 
@@ -121,7 +145,7 @@ def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
             "empty": b"" if row.size > 1 else None,
         }
         for why, data in tried.items():
-            if data is not None:
+            if data is not None and len(data) in sizes(row.klass):
                 title = f"{row.name} with {len(data)} bytes ({why}) is refused for its length"
                 run = partial(_refused, row, data, INVALID_LENGTH, None)
                 yield case_in("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
@@ -157,7 +181,7 @@ def _telemetry(unit: Unit, row: Row) -> Iterator[Case[LinkProbe]]:
 def _agreement(unit: Unit) -> Iterator[Case[LinkProbe]]:
     """Yield the case for numbers that several fields report: the layouts differ, the values must not."""
     places: dict[tuple[str, str], list[tuple[Row, str]]] = {}
-    for row in unit.telemetry.values():
+    for row in unit.readable.values():
         for name, item in row.named.items():
             if item.value is not None and item.kind in ("integer", "float", "bits") and item.enum is None:
                 places.setdefault((item.value, item.unit), []).append((row, name))
@@ -423,7 +447,7 @@ def _subscribe(command: Row, fields: list[str], offered: list[Row], probe: LinkP
 
 
 def _flood(probe: LinkProbe) -> None:
-    rows = sorted(probe.unit.telemetry.values(), key=lambda row: row.size)[:2]
+    rows = sorted(probe.unit.readable.values(), key=lambda row: row.size)[:2]
     for number in range(FLOOD):
         probe.post(rows[number % len(rows)])
     for number in range(FLOOD):

@@ -142,7 +142,7 @@ class Unit:
         The row includes the fields of the telecommand, or has the same parameters in the same layout.
         """
         found = {}
-        for row in self.telemetry.values():
+        for row in self.readable.values():
             for name in {
                 item.telecommand: None for item in row.named.values() if item.telecommand is not None
             }:
@@ -152,7 +152,7 @@ class Unit:
             fields = {
                 item.of_parameter: item.name for item in command.named.values() if item.parameter is not None
             }
-            for row in self.telemetry.values() if command.action == "set_parameters" and fields else ():
+            for row in self.readable.values() if command.action == "set_parameters" and fields else ():
                 places = {
                     fields[item.of_parameter]: item.name
                     for item in row.named.values()

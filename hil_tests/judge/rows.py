@@ -318,6 +318,11 @@ class Row:
         """Whether the row is telemetry."""
         return self.kind == "telemetry"
 
+    @property
+    def is_streamed(self) -> bool:
+        """Whether the unit sends the row regularly: at a rate, or with each measurement."""
+        return isinstance(self.unsolicited, float) or "frame" in (self.unsolicited or ())
+
     def example(self) -> dict[str, Value]:
         """Return values that must be accepted."""
         return {name: item.plain for name, item in self.named.items()}
