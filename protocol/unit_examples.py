@@ -76,7 +76,9 @@ def served(icd: InterfaceDefinition) -> tuple[list[str], list[Exchange]]:
             found += [] if exchange is None else [exchange]
     for text, rows in failed.items():
         more = len(rows) - 1
-        errors.append(_of_row(icd, rows[0], text + (f" (and {more} more row{'s'[: more - 1]})" if more else "")))
+        errors.append(
+            _of_row(icd, rows[0], text + (f" (and {more} more row{'s'[: more - 1]})" if more else ""))
+        )
     if icd.canopen is not None:
         try:
             build_eds(DeviceDictionary(icd))
@@ -126,7 +128,9 @@ def _serial_exchange(
     request, replies = _messages(icd, row, values, stack.answers(row))
     sent: tuple[str, ...] = ()
     if request is not None:
-        with _Part("request", "or set `request = false` if the row is only sent" if row.kind == "telemetry" else ""):
+        with _Part(
+            "request", "or set `request = false` if the row is only sent" if row.kind == "telemetry" else ""
+        ):
             line = stack.encode_request(request)
             _check_framing(stack, row, request, line)
         sent = (_hex(line),)

@@ -17,6 +17,7 @@ from starhil.hil_tests.conformance.attitude_cases import (
     mode_command,
 )
 from starhil.hil_tests.conformance.case import Case, CaseSkipped, case_in, check, check_equal, rule
+from starhil.hil_tests.conformance.clock_cases import clock_cases
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -25,6 +26,7 @@ from starhil.hil_tests.conformance.link_probe import (
     changes_link,
     checked_values,
 )
+from starhil.hil_tests.conformance.unjudged_cases import unjudged_cases
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Value
 from starhil.hil_tests.judge.rows import Field, Row
@@ -81,8 +83,10 @@ def row_cases(
                 yield case_in("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
     yield from _agreement(unit)
     yield from _settings(unit, marks)
+    yield from clock_cases(unit)
     yield from _unsolicited(unit)
     yield from _subscriptions(unit)
+    yield from unjudged_cases(unit, _compared(unit))
     yield case_in(
         "recovery", "flood", "a flood of requests is answered completely and in order", _flood, rule(10)
     )
@@ -93,11 +97,13 @@ def sent_cases(unit: Unit) -> Iterator[Case[LinkProbe]]:
     for row in unit.telemetry.values():
         if row.is_streamed:
             yield from _telemetry(unit, row)
+    yield from clock_cases(unit)
     yield from _unsolicited(unit)
 
     def requests(_probe: LinkProbe) -> None:
         raise CaseSkipped("no request reads a row, so that no case can see whether a request was taken")
 
+    yield from unjudged_cases(unit, ())
     title = "framing, check, header, IDs, lengths and values of requests"
     yield case_in("unjudged", "requests", title, requests, "[[telemetry]]: `request = false` in all rows")
 
@@ -180,21 +186,14 @@ def _telemetry(unit: Unit, row: Row) -> Iterator[Case[LinkProbe]]:
 
 def _agreement(unit: Unit) -> Iterator[Case[LinkProbe]]:
     """Yield the case for numbers that several fields report: the layouts differ, the values must not."""
-    places: dict[tuple[str, str], list[tuple[Row, str]]] = {}
-    for row in unit.readable.values():
-        for name, item in row.named.items():
-            if item.value is not None and item.kind in ("integer", "float", "bits") and item.enum is None:
-                places.setdefault((item.value, item.unit), []).append((row, name))
-    shared = {
-        quantity: found for quantity, found in places.items() if len({_layout(*place) for place in found}) > 1
-    }
+    shared = _shared(unit)
     if not shared:
         return
 
     def run(probe: LinkProbe) -> None:
         with identifying_stars(probe):
             probe.sleep(SETTLING_S)
-            for (quantity, _unit), (first, *others) in shared.items():
+            for quantity, (first, *others) in shared.items():
                 for other in others:
                     _compare(probe, quantity, first, other)
 
@@ -202,6 +201,28 @@ def _agreement(unit: Unit) -> Iterator[Case[LinkProbe]]:
     yield case_in(
         "agreement", "rows", title, run, "[[telemetry]]: fields with the same `value`", intrusive=True
     )
+
+
+def _shared(unit: Unit) -> dict[str, list[tuple[Row, str]]]:
+    """Return the fields of each quantity that several layouts report in one unit of measure."""
+    places: dict[tuple[str, str], list[tuple[Row, str]]] = {}
+    for row in unit.readable.values():
+        for name, item in row.named.items():
+            if item.value is not None and item.kind in ("integer", "float", "bits") and item.enum is None:
+                places.setdefault((item.value, item.unit), []).append((row, name))
+    return {
+        quantity: found
+        for (quantity, _unit), found in places.items()
+        if len({_layout(*place) for place in found}) > 1
+    }
+
+
+def _compared(unit: Unit) -> Iterator[tuple[Row, str]]:
+    """Yield the fields that are compared with what was set, or with other fields."""
+    for places in _shared(unit).values():
+        yield from places
+    for _, row, names in _read_back(unit):
+        yield from ((row, name) for name in names.values())
 
 
 def _layout(row: Row, name: str) -> tuple[object, ...]:
@@ -244,16 +265,24 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
         if row.action in (None, "nothing") or row.action in own:
             title = f"{row.name} is accepted"
             yield case_in("commands", row.name, title, partial(_accepted, row), row, intrusive=True)
-    for command, row, places in unit.reported:
+    for command, row, places in _read_back(unit):
         run = partial(_set_and_read, command, row, places, marks)
         name = f"{row.name}.{command.name}"
-        if command.action == "set_parameters" and not changes_link(unit, command):
+        if command.action == "set_parameters":
             title = f"{row.name} reports the parameters set by {command.name}"
             yield case_in("settings", name, title, run, row, intrusive=True)
-        elif command.action in (None, "nothing"):
+        else:
             title = f"{row.name} reports the bytes set by {command.name}"
             alone = sum(other is row for _, other, _ in unit.reported) == 1
             yield case_in("settings", row.name if alone else name, title, run, row, intrusive=True)
+
+
+def _read_back(unit: Unit) -> Iterator[tuple[Row, Row, Mapping[str, str]]]:
+    """Yield the telecommands whose values cases set and read, as `Unit.reported` has them."""
+    for command, row, places in unit.reported:
+        kept = command.action == "set_parameters" and not changes_link(unit, command)
+        if kept or command.action in (None, "nothing"):
+            yield command, row, places
 
 
 def _accepted(row: Row, probe: LinkProbe) -> None:

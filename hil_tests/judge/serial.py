@@ -185,7 +185,12 @@ class SerialLine:
             answer.row_id in (None, asked.id) or self._follows(asked, answer) or answer.kind == "malformed"
         )
         streamed = (answer.klass, answer.row_id) in self.streamed
-        if streamed and not awaited and answer.kind == "telemetry" and not envelope.marks_unsolicited(answer.klass):
+        if (
+            streamed
+            and not awaited
+            and answer.kind == "telemetry"
+            and not envelope.marks_unsolicited(answer.klass)
+        ):
             return replace(answer, kind="unsolicited")
         if awaited and answer.final and answer.kind not in ("unsolicited", "burst"):
             self._left -= 1
@@ -293,7 +298,9 @@ class Headed:
         coded = [item for item in unit.classes if item.code is not None]
         requests = [(item.name, item.code) for item in coded]
         replies = [(item.name, item.code if item.reply is None else item.reply) for item in coded]
-        self._marked = {item.name for item in coded if item.unsolicited not in (None, dict(replies)[item.name])}
+        self._marked = {
+            item.name for item in coded if item.unsolicited not in (None, dict(replies)[item.name])
+        }
         self._unsolicited = {item.unsolicited for item in coded if item.unsolicited is not None}
         replies += [(item.name, item.unsolicited) for item in coded if item.unsolicited is not None]
         self.requests = Header(link.request_header, order, requests, sizes)

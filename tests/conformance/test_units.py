@@ -40,7 +40,7 @@ def test_a_bundled_unit_passes_every_case_of_its_definition(unit: str, link: str
     with SimulatedUnit(link, unit=unit) as simulated:
         outcomes = run_cases(simulated.probe, cases)
     assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
-    assert [o.id for o in outcomes if o.status == "skipped"] == []
+    assert [o.id for o in outcomes if o.status == "skipped" and ".unjudged." not in o.id] == []
     assert len(outcomes) >= 15
 
 
