@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
@@ -56,10 +55,6 @@ def _check_field(field: Field, row: Row, action: ActionModel | None, icd: Interf
         raise IcdError("sets nothing; bind it to a parameter with `parameter`, or leave out its name")
 
 
-SELECTING: Final = frozenset({"subscribe", "select_unsolicited"})
-"""Actions that select rows to be sent unsolicited."""
-
-
 def unbound(icd: InterfaceDefinition) -> list[str]:
     """Return an error message for each row or field that the device cannot serve, because nothing gives it a value or sends it."""
     missing = [
@@ -75,7 +70,7 @@ def unbound(icd: InterfaceDefinition) -> list[str]:
         for field in row.named_fields.values()
         if (field.value, field.const, field.parameter, field.default, field.telecommand) == (None,) * 5
     ]
-    if not any(row.action in SELECTING or row.action in icd.plugin.actions for row in icd.rows):
+    if not icd.selects_unsolicited:
         answers = {answer for row in icd.rows for answer in row.answers}
         missing += [
             f"{icd.files[row.name]}: telemetry {row.name}: `request = false`, but nothing sends it; add `unsolicited`, "

@@ -208,6 +208,12 @@ class SerialStack:
         replies = self.in_dialect(dialect)
         return replies is None or ReplyKind.UNSOLICITED in replies.headers
 
+    def marks_unsolicited(self, klass: str) -> bool:
+        """Return whether unsolicited telemetry of a class differs from an answer by more than that nothing requested it."""
+        item = self.classes.get(klass)
+        codes = item is not None and item.code is not None and item.unsolicited_code != item.reply_code
+        return bool(self.dialects) or codes
+
     def counts(self, kind: ReplyKind) -> bool:
         """Return whether the device numbers messages of this kind itself."""
         unsolicited = kind in (ReplyKind.UNSOLICITED, ReplyKind.EVENT)

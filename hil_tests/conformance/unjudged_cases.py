@@ -13,7 +13,7 @@ from starhil.hil_tests.conformance.link_probe import REPORTED, LinkProbe
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.rows import Field, Row
 
-CLAUSE: Final = "docs/rules.md, What no derived case covers"
+CLAUSE: Final = "[[telemetry]]: `value` of a field"
 PLUGIN: Final = "plugin"
 LISTED: Final = 20
 """Number of fields that a reason names."""

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cantools
 import pytest
 
 from starhil.emulator.profile import Profile
 from starhil.emulator.run import _unit_of
 from starhil.protocol.errors import OneLineError
+from starhil.protocol.export import export, export_folder
+from starhil.protocol.icd import load_unit
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from starhil.protocol.unit_examples import examine
+from tests.emulator.conftest import Bench
 from tests.user_units import ATTITUDE, HEAD, STREAM, packets, written
 
 SUBSCRIBING = (
@@ -146,3 +151,42 @@ def test_a_request_that_the_receiver_drops_says_why(tmp_path: Path) -> None:
     assert found[0].endswith(
         "framing length does not return the request that it encoded; it returns: message longer than 2 bytes (and 3 more rows)"
     )
+
+
+ON_CAN = (
+    HEAD
+    + ATTITUDE.replace("ID", "130").replace("KEYS", "request = false\nunsolicited = 2.0")
+    + '[link.can]\nkind = "cubespace"\n'
+)
+
+
+def test_exports_have_the_row_but_no_request_for_it(tmp_path: Path) -> None:
+    on_can = load_unit(written(tmp_path / "can", ON_CAN))
+    dbc = cantools.database.load_string(export(on_can, "dbc"), "dbc")
+    (message,) = dbc.messages
+    assert (message.name, message.frame_id) == (
+        "TLM_attitude",
+        0x0A820401,
+    )  # 10: first segment of unsolicited telemetry
+    assert "without a request: `0A820401#" in export(on_can, "markdown")
+    assert ", only sent" in export(on_can, "html")
+    on_serial = load_unit(
+        written(
+            tmp_path / "serial", STREAM.replace('name = "attitude"\n', 'name = "attitude"\nrequest = false\n')
+        )
+    )
+    commands = export_folder(on_serial, "cosmos-plugin")
+    (text,) = (text for name, text in commands.items() if name.endswith("cmd.txt"))
+    assert "REQUEST_STATUS" in text
+    assert "REQUEST_ATTITUDE" not in text
+
+
+def test_the_device_refuses_a_request_for_the_row_and_sends_it(tmp_path: Path) -> None:
+    bench = Bench(unit=str(written(tmp_path / "unit", packets()))).start()
+    sent: list[Reply] = []
+    bench.device.signals.unsolicited.connect(sent.append)
+    row = bench.icd.telemetry["attitude"]
+    (reply,) = bench.requests.handle(bench.icd.request(row))
+    assert (reply.kind, reply.code) == (ReplyKind.NACK, ErrorCode.INVALID_ID)
+    bench.step(3.0)
+    assert {(item.kind, item.id) for item in sent} == {(ReplyKind.UNSOLICITED, row.id)}
