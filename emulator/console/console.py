@@ -296,7 +296,7 @@ class Console:
         begins, viewer.wire = not viewer.wire, bool(request.get("wire"))
         if begins and viewer.wire:
             viewer.send(json.dumps({"type": "wire", "lines": self.trace.recent(), "left_out": 0}))
-        known = {row.name for row in self._head.device.icd.readable}
+        known = frozenset(row.name for row in self._head.device.icd.readable)
         viewer.rows = known.intersection(rows)
         self._viewers_changed()
         return {}

@@ -18,7 +18,7 @@ from typing import Any, Literal
 from starhil.hil_tests.judge.rows import SIZES
 
 
-class InexpressibleError(Exception):
+class InexpressibleError(OverflowError):
     """A message that no header of the unit can express."""
 
 

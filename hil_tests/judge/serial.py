@@ -90,6 +90,8 @@ class SerialLine:
             (row.klass, row.id) for row in unit.telemetry.values() if row.unsolicited is not None
         }
         """Class and ID of the rows that may come without a request, though nothing in their messages says so."""
+        self._left = 0
+        """Number of answers to the oldest request that have not come."""
         self.clear()
 
     def request_format(self, klass: str) -> tuple[Framing, Envelope]:
