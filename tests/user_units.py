@@ -119,6 +119,27 @@ reply_header = [{ role = "length", type = "u8" }, { role = "id", type = "u8" }, 
 )
 """A unit without classes whose streamed rows look like answers, and whose length is one byte."""
 
+ON_CAN: Final = (
+    HEAD
+    + """
+[[telecommand]]
+id = 4
+name = "ping"
+doc = "d"
+action = "nothing"
+answer = ["reply", "row:status"]
+"""
+    + STATUS.replace("id = 2", "id = 130")
+    + ATTITUDE.replace("ID", "131").replace("KEYS", 'request = false\nunsolicited = ["frame"]')
+    + """
+[link.can]
+kind = "cubespace"
+[link.serial]
+framing = { kind = "cubespace" }
+"""
+)
+"""CubeSpace's links, on which a telecommand is answered by a row too, and a row comes with each frame."""
+
 
 def packets(length: str = "u16") -> str:
     """Return the unit of space packets with a length of a type."""

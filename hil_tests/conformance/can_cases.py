@@ -40,7 +40,8 @@ def can_names(unit: Unit) -> dict[str, str]:
     `unknown_telemetry`. `single_size`, `single_data`: size and data, which for telemetry are any. `m0` to `m4`: segments of
     a message that is answered by `refusal`, and `t0` to `t4` from another host. Each error has its code.
     """
-    telemetry, commands = unit.readable.values(), unit.telecommands.values()
+    telemetry = [row for row in unit.readable.values() if row.answers == ("reply",)]
+    commands = [row for row in unit.telecommands.values() if row.answers == ("reply",)]
     shown = [row for row in telemetry if 8 < row.size <= LONGEST]
     faulty = {row.id: data for row in commands for data in _bad_data(row)[:1] if row.size <= 8}
     rows: dict[str, Iterable[Row]] = {

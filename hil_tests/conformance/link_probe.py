@@ -118,6 +118,8 @@ class LinkProbe(Probe):
     """How many numbers the header has for messages; 0 if it has none."""
     has_codes = True
     """Whether a refusal carries a code."""
+    names_rows = True
+    """Whether an answer names its row."""
 
     def __init__(
         self, port: Port[Any], unit: Unit, times: ProbeTimes | None, settings: Settings | None = None
@@ -232,13 +234,17 @@ class LinkProbe(Probe):
 
         Other rows that answer a request follow its reply, or stand for it.
         """
+        others = []
+        if isinstance(row, Row):
+            named = [item.partition(":")[2] for item in self.answers(row)]
+            others = [self.unit.telemetry[name] for name in named if name]
+        if others and not self.names_rows:
+            raise CaseSkipped(f"on this link an answer does not name its row, such as {others[0].name}")
         self.post(row, data, klass)
         answer = self.last_answer()
-        if not isinstance(row, Row) or answer.kind not in ("ack", "telemetry"):
+        if not isinstance(row, Row) or not others or answer.kind not in ("ack", "telemetry"):
             return answer
-        named = [item.partition(":")[2] for item in self.answers(row)]
-        others = [self.unit.telemetry[name] for name in named if name]
-        if others and answer.row_id != row.id and "reply" not in self.answers(row):
+        if answer.row_id != row.id and "reply" not in self.answers(row):
             self._check_row(others.pop(0), answer)
             answer = replace(answer, kind="ack", row_id=row.id, klass=row.klass)
         for other in others:

@@ -48,6 +48,7 @@ class SerialProbe(LinkProbe):
         self.baud = baud
         self.has_unsolicited = self.line.envelope.has_unsolicited
         self.has_codes = self.line.envelope.has_codes
+        self.names_rows = self.line.envelope.names_rows
         self.numbers = self.line.envelope.numbers
         self.raw = b""
         self.sent = b""

@@ -310,6 +310,7 @@ class Headed:
         self._codes = dict(requests)
         self.has_codes = "status" in self.replies.roles() or CODE in (link.refusal or "")
         self.has_final = "final" in self.replies.roles()
+        self.names_rows = "id" in self.replies.roles()
         self.sequence_bits = self.requests.width("sequence")
         self.numbers = 1 << self.replies.width("sequence")
         self._numbered = self.replies.counted()
@@ -449,6 +450,7 @@ class Dialect:
     def __init__(self, unit: Unit, dialect: str) -> None:
         self._unit, self._dialect = unit, dialect
         self.has_unsolicited = dialect == "c"
+        self.names_rows = dialect != "b"
 
     def body(self, request: Request) -> bytes:
         """Return ID and data."""
@@ -520,5 +522,6 @@ Envelope = Headed | Dialect
 """What surrounds the data of a message within its framing.
 
 `sequence_bits` is the width of the number of a request, 0 without one; `numbers` is how many numbers an answer may have;
-`has_codes` is whether a refusal carries a code, `has_final` whether a message says that it is the last of an answer.
+`has_codes` is whether a refusal carries a code, `has_final` whether a message says that it is the last of an answer,
+`names_rows` whether an answer has the ID of its row.
 """

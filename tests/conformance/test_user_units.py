@@ -8,25 +8,26 @@ import pytest
 
 from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.conformance.runner import run_case, run_cases
-from starhil.hil_tests.conformance.suites import serial_suite
+from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
 from tests.conformance.simulated import SimulatedUnit
-from tests.user_units import STREAM, packets, written
+from tests.user_units import ON_CAN, STREAM, packets, written
 
+SUITES = {"serial": serial_suite, "can": can_suite}
 TRUTH = from_radec_roll(83.8, -1.2, 0.0)
 
 
-def outcomes_of(unit: Path, served: Path | None = None, case: str | None = None):
-    """Run all cases, or one, on a simulated unit whose truth is known; return the outcomes by ID."""
-    cases = serial_suite(read_unit(unit))
-    with SimulatedUnit("serial", unit=unit, served=served) as simulated:
+def outcomes_of(unit: Path, served: Path | None = None, case: str | None = None, link: str = "serial"):
+    """Run all cases, or one, on a simulated unit whose truth is known; return the outcomes by ID without the link."""
+    cases = SUITES[link](read_unit(unit))
+    with SimulatedUnit(link, unit=unit, served=served) as simulated:
         simulated.probe.truth = lambda: TRUTH
         if case is None:
             outcomes = run_cases(simulated.probe, cases)
         else:
-            chosen = [item for item in cases if item.id == f"serial.{case}"]
+            chosen = [item for item in cases if item.id == f"{link}.{case}"]
             outcomes = [run_case(simulated.probe, item) for item in chosen]
-    return {outcome.id.removeprefix("serial."): outcome for outcome in outcomes}
+    return {outcome.id.removeprefix(f"{link}."): outcome for outcome in outcomes}
 
 
 def bad(outcomes) -> list[tuple[str, str, str]]:
@@ -52,6 +53,36 @@ def test_a_healthy_unit_passes(tmp_path: Path, name: str) -> None:
     outcomes = outcomes_of(written(tmp_path / "unit", UNITS[name]))
     assert bad(outcomes) == []
     assert outcomes["attitude.attitude"].status == "passed"
+
+
+def test_a_row_that_comes_with_each_frame_on_can_is_judged(tmp_path: Path) -> None:
+    unit = written(tmp_path / "unit", ON_CAN)
+    outcomes = outcomes_of(unit, link="can")
+    assert bad(outcomes) == []
+    passed = {name for name, outcome in outcomes.items() if outcome.status == "passed"}
+    assert passed >= {
+        "attitude.attitude",
+        "unsolicited.attitude",
+        "commands.ping",
+        "clocks.status.telecommands",
+    }
+    negated = ON_CAN.replace('"f64", value = "attitude.x"', '"f64", scale = -1, value = "attitude.x"')
+    wrong = outcomes_of(unit, written(tmp_path / "served", negated), "attitude.attitude", "can")
+    assert wrong["attitude.attitude"].status == "failed"
+
+
+def test_where_answers_name_no_row_one_that_follows_is_not_judged(tmp_path: Path) -> None:
+    outcomes = outcomes_of(written(tmp_path / "unit", ON_CAN))  # dialect b
+    assert bad(outcomes) == []
+    assert outcomes["commands.ping"].seen == "on this link an answer does not name its row, such as status"
+
+
+def test_a_telecommand_that_another_row_answers_fails(tmp_path: Path) -> None:
+    text = STREAM.replace('action = "nothing"\n', 'action = "nothing"\nanswer = ["reply", "row:status"]\n')
+    unit = written(tmp_path / "unit", text)
+    for number, answer in enumerate(('["reply", "row:attitude"]', '["reply"]', '["row:status"]')):
+        served = written(tmp_path / f"served_{number}", text.replace('["reply", "row:status"]', answer))
+        assert outcomes_of(unit, served, "commands.ping")["commands.ping"].status == "failed", answer
 
 
 def test_a_message_is_no_longer_than_its_length_can_state(tmp_path: Path) -> None:
