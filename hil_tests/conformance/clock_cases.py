@@ -18,7 +18,7 @@ from functools import partial
 from typing import Final
 
 from starhil.hil_tests.conformance.attitude_cases import changes_mode, identifying_stars
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, case_in, check
+from starhil.hil_tests.conformance.case import Case, CaseSkipped, Probe, case_in, check
 from starhil.hil_tests.conformance.link_probe import FRAME_S, LinkProbe
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Value
@@ -147,7 +147,7 @@ def clock_cases(unit: Unit) -> Iterator[Case[LinkProbe]]:
 
 
 @dataclass(frozen=True)
-class _Passage:
+class Passage:
     """Two readings of a row, and the shortest and longest time between them, s."""
 
     before: Mapping[str, Value]
@@ -160,17 +160,18 @@ class _Passage:
         return self.least_s * (1.0 - DRIFT) - tolerance_s, self.most_s * (1.0 + DRIFT) + tolerance_s
 
 
-def _passage(probe: LinkProbe, row: Row, between: Callable[[], None]) -> _Passage:
+def passage_of(probe: Probe, row: Row, between: Callable[[], None]) -> Passage:
+    """Read a row before and after something."""
     t1 = probe.now()
     before = probe.values(row)
     t2 = probe.now()
     between()
     t3 = probe.now()
     after = probe.values(row)
-    return _Passage(before, after, t3 - t2, probe.now() - t1)
+    return Passage(before, after, t3 - t2, probe.now() - t1)
 
 
-def _counted(item: Field, passage: _Passage) -> float | None:
+def _counted(item: Field, passage: Passage) -> float | None:
     """Return by how much a count has advanced; None if it stands at its limit, which it does not leave."""
     before, after = float(passage.before[item.name]), float(passage.after[item.name])
     if after >= item.limits[1] and not item.wrap:
@@ -178,7 +179,7 @@ def _counted(item: Field, passage: _Passage) -> float | None:
     return after - before + (_span(item) if after < before and item.wrap else 0.0)
 
 
-def _check_sent(row: Row, counts: list[Field], passage: _Passage, telemetry: int, telecommands: int) -> None:
+def _check_sent(row: Row, counts: list[Field], passage: Passage, telemetry: int, telecommands: int) -> None:
     for item in counts:
         seen = _counted(item, passage)
         per_read, per_command = SENT[item.quantity]
@@ -187,18 +188,23 @@ def _check_sent(row: Row, counts: list[Field], passage: _Passage, telemetry: int
         check(seen in (None, wanted), at, f"{passage.before[item.name]!s} and {passage.after[item.name]!s}")
 
 
+def check_times(row: Row, times: list[Time], passage: Passage, epoch: str) -> None:
+    """Fail the case unless times have advanced as the tester's clock has."""
+    for item in times:
+        low, high = passage.within(item.resolution_s)
+        passed = item.passed(passage.before, passage.after, epoch)
+        wanted = f"{row.name}.{item} {low:.3f} to {high:.3f} s later, by the tester's clock"
+        check(low <= passed <= high, wanted, f"{passed:.9g} s")
+
+
 def _clocks(row: Row, times: list[Time], asked: list[Field], probe: LinkProbe) -> None:
     def wait() -> None:
         for _ in range(ASKED if probe.unit.readable else 0):
             probe.expect_alive()
         probe.sleep(PAUSE_S)
 
-    passage = _passage(probe, row, wait)
-    for item in times:
-        low, high = passage.within(item.resolution_s)
-        passed = item.passed(passage.before, passage.after, probe.unit.conventions.epoch)
-        wanted = f"{row.name}.{item} {low:.3f} to {high:.3f} s later, by the tester's clock"
-        check(low <= passed <= high, wanted, f"{passed:.9g} s")
+    passage = passage_of(probe, row, wait)
+    check_times(row, times, passage, probe.unit.conventions.epoch)
     _check_sent(row, asked, passage, ASKED + 1, 0)
 
 
@@ -207,7 +213,7 @@ def _commands(row: Row, counts: list[Field], command: Row, probe: LinkProbe) -> 
         for _ in range(ASKED):
             probe.send_command(command, command.encode())
 
-    _check_sent(row, counts, _passage(probe, row, send), 1, ASKED)
+    _check_sent(row, counts, passage_of(probe, row, send), 1, ASKED)
 
 
 def _measurements(row: Row, times: list[Time], counts: list[Field], probe: LinkProbe) -> None:
@@ -215,7 +221,7 @@ def _measurements(row: Row, times: list[Time], counts: list[Field], probe: LinkP
     commanded = changes_mode(probe.unit.telecommands.values())
     with identifying_stars(probe) if commanded else nullcontext():
         probe.sleep(PAUSE_S)
-        passage = _passage(probe, row, partial(probe.sleep, 2 * PAUSE_S))
+        passage = passage_of(probe, row, partial(probe.sleep, 2 * PAUSE_S))
     still = []
     for time in times:
         passed = time.passed(passage.before, passage.after, probe.unit.conventions.epoch)

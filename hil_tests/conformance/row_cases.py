@@ -27,7 +27,7 @@ from starhil.hil_tests.conformance.link_probe import (
     changes_link,
     checked_values,
 )
-from starhil.hil_tests.conformance.unjudged_cases import unjudged_cases
+from starhil.hil_tests.conformance.unjudged_cases import unjudged_cases, unjudged_fields
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Value
 from starhil.hil_tests.judge.rows import Field, Row
@@ -87,7 +87,7 @@ def row_cases(
     yield from clock_cases(unit)
     yield from _unsolicited(unit)
     yield from _subscriptions(unit)
-    yield from unjudged_cases(unit, _compared(unit))
+    yield from unjudged_cases(unit, unjudged_fields(unit, _compared(unit)))
     yield case_in(
         "recovery", "flood", "a flood of requests is answered completely and in order", _flood, rule(10)
     )
@@ -104,7 +104,7 @@ def sent_cases(unit: Unit) -> Iterator[Case[LinkProbe]]:
     def requests(_probe: LinkProbe) -> None:
         raise CaseSkipped("no request reads a row, so that no case can see whether a request was taken")
 
-    yield from unjudged_cases(unit, ())
+    yield from unjudged_cases(unit, unjudged_fields(unit, ()))
     title = "framing, check, header, IDs, lengths and values of requests"
     yield case_in("unjudged", "requests", title, requests, "[[telemetry]]: `request = false` in all rows")
 
