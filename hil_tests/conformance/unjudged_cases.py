@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, changes_mode
 from starhil.hil_tests.conformance.case import Case, CaseSkipped, Probe, case_in
@@ -19,7 +19,7 @@ LISTED: Final = 20
 """Number of fields that a reason names."""
 
 
-def unjudged_cases(unit: Unit, fields: Iterable[tuple[Row, Field]]) -> Iterator[Case[Probe]]:
+def unjudged_cases(unit: Unit, fields: Iterable[tuple[Row, Field]]) -> Iterator[Case[Any]]:
     """Yield a case for each kind of quantity that these fields report, which no other case judges."""
     groups: dict[str, list[str]] = {}
     for row, item in fields:

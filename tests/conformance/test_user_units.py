@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 
 from starhil.hil_tests.attitude import from_radec_roll
+from starhil.hil_tests.conformance.canopen_suite import canopen_suite
 from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
+from starhil.protocol.names import UNITS_FOLDER
 from tests.conformance.simulated import SimulatedUnit
 from tests.user_units import ON_CAN, STREAM, packets, written
 
@@ -175,3 +177,16 @@ def test_an_attitude_of_the_plugin_is_listed_as_not_judged(tmp_path: Path) -> No
     assert "serial.unjudged.attitude" in {
         item.id for item in cases
     }  # w, y, z and valid, which alone state no attitude
+
+
+def test_a_time_in_another_unit_on_canopen_fails(tmp_path: Path) -> None:
+    text = (UNITS_FOLDER / "oresat" / "oresat.toml").read_text(encoding="utf-8")
+    field = 'name = "uptime", type = "u32", unit = "s"'
+    assert field in text
+    served = written(tmp_path / "served", text.replace(field, field.replace('unit = "s"', 'unit = "ms"')))
+    (case,) = [item for item in canopen_suite(read_unit("oresat")) if item.id == "canopen.clocks.system"]
+    statuses = []
+    for folder in (None, served):
+        with SimulatedUnit("canopen", unit="oresat", served=folder) as simulated:
+            statuses.append(run_case(simulated.probe, case).status)
+    assert statuses == ["passed", "failed"]
