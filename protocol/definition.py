@@ -47,6 +47,8 @@ class Names(dict[str, _Item]):
 
 SELECTING: Final = frozenset({"subscribe", "select_unsolicited"})
 """Actions that select rows to be sent unsolicited."""
+SELECTION: Final = "unsolicited_selection"
+"""Parameter that selects a row to be sent unsolicited."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +105,10 @@ class InterfaceDefinition:
 
     @cached_property
     def selects_unsolicited(self) -> bool:
-        """Whether a telecommand may select any telemetry row to be sent unsolicited."""
+        """Whether a telecommand or a parameter may select any telemetry row to be sent unsolicited."""
         actions = SELECTING.union(self.plugin.actions)
-        return any(row.action in actions for row in self.telecommands.values())
+        by_command = any(row.action in actions for row in self.telecommands.values())
+        return by_command or SELECTION in self.parameters or self.plugin.skipped is not None
 
     @cached_property
     def parameters_by_id(self) -> Mapping[int, Parameter]:

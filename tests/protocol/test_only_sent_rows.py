@@ -89,6 +89,8 @@ def test_a_row_that_nothing_sends_is_an_error(tmp_path: Path) -> None:
         "telemetry attitude: `request = false`, but nothing sends it; add `unsolicited`, or 'row:attitude'"
     )
     assert errors(tmp_path / "selected", HEAD + SUBSCRIBING + never + link) == []
+    parameter = '[[parameter]]\nid = 2\nname = "unsolicited_selection"\n'
+    assert errors(tmp_path / "by_parameter", HEAD + parameter + never + link) == []
 
 
 def test_a_telecommand_is_always_requested(tmp_path: Path) -> None:
