@@ -34,7 +34,7 @@ from starhil.emulator.tape import Recorder, Wiring
 from starhil.emulator.truth.truth import Truth, TruthHost
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
-from starhil.protocol.icd_bindings import unbound
+from starhil.protocol.unit_examples import served
 
 
 class Run:
@@ -153,8 +153,8 @@ class Run:
 def _unit_of(profile: Profile) -> InterfaceDefinition:
     """Return the unit of a profile, which must have the requested links."""
     icd = load_unit(profile.unit_source)
-    missing = unbound(icd)
-    if missing:
-        raise EmulatorError(*missing)
+    errors, _ = served(icd)
+    if errors:
+        raise EmulatorError(*errors)
     check_links(profile, icd)
     return icd

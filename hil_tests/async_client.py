@@ -73,9 +73,13 @@ class AsyncObcClient:
     async def read(self, name: str, *, timeout_s: float | None = None, retries: int | None = None) -> Reading:
         """Read a telemetry row.
 
-        Raises NackError, NoReplyError, BadReplyError, LinkLostError.
+        Raises NackError, NoReplyError, BadReplyError, LinkLostError; BenchError for a row that is only sent.
         """
         row = self.icd.telemetry[name]
+        if row.only_sent:
+            raise BenchError(
+                f"{row.name}: is only sent, and no request reads it; wait for it as unsolicited telemetry"
+            )
         request = self.icd.request(row)
         reply, latency = await self.transact(request, row.name, timeout_s=timeout_s, retries=retries)
         return self._reading(reply, latency)
@@ -259,7 +263,16 @@ class AsyncObcClient:
             if self._answers(request, reply) and not future.done():
                 future.set_result((reply, now))
                 return
-        self.stray_replies.append(reply)
+        row = self._row_of(reply)
+        if (
+            row is not None
+            and reply.kind is ReplyKind.TELEMETRY
+            and (row.unsolicited is not None or self.icd.selects_unsolicited)
+            and not self.link.marks_unsolicited(reply.klass)
+        ):
+            self._on_unsolicited(reply)
+        else:
+            self.stray_replies.append(reply)
 
     def _answers(self, request: Request, reply: Reply) -> bool:
         """Return whether a reply answers a request; a telecommand may be answered with a telemetry row."""

@@ -225,7 +225,7 @@ async def _measure_links(
         for count in turns:
             with closing(Viewers(ready.get("view", ""), count)):
                 await asyncio.sleep(SETTLE_S if count else 0.0)
-                latencies = await ask_in_turn(asks, rows or icd.telemetry.values(), seconds / turns.count(0))
+                latencies = await ask_in_turn(asks, rows or icd.readable, seconds / turns.count(0))
             for link, values in latencies.items():
                 taken.setdefault((count, link), []).extend(values)
     return taken

@@ -69,6 +69,10 @@ class HostLink(ABC, Generic[Item]):
         """Return the answers of a row on this link; none if no reply may be awaited."""
         return row.answers
 
+    def marks_unsolicited(self, klass: str) -> bool:  # noqa: ARG002 -- on most links, all of it
+        """Return whether unsolicited telemetry of a class says that it is."""
+        return True
+
     def is_from_device(self, item: Item) -> bool:  # noqa: ARG002 -- nobody else sends on a line
         """Return whether the device has sent a received item."""
         return True
@@ -150,6 +154,10 @@ class SerialHostLink(HostLink[bytes]):
         """Frame and send a request."""
         self._receiver.expect(request)
         self.send(self._stack.encode_request(request))
+
+    def marks_unsolicited(self, klass: str) -> bool:
+        """Return whether unsolicited telemetry of a class says that it is."""
+        return self._stack.marks_unsolicited(klass)
 
     def answers(self, row: Row) -> tuple[str, ...]:
         """Return the answers of a row on the serial line."""

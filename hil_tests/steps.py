@@ -79,6 +79,13 @@ def _telemetry(name: str, icd: InterfaceDefinition) -> Row:
     return icd.telemetry[name]
 
 
+def _readable(name: str, icd: InterfaceDefinition) -> Row:
+    row = _telemetry(name, icd)
+    if row.only_sent:
+        raise ValueError(f"{name!r} is only sent, and no request reads it: use listen")
+    return row
+
+
 def _telecommand(name: str, icd: InterfaceDefinition) -> Row:
     if name in icd.telemetry:
         raise ValueError(f"{name!r} is telemetry: use read")
@@ -127,6 +134,7 @@ def _file_name(name: str) -> str:
 
 
 Telemetry = Annotated[Row, _read_by(_telemetry)]
+Readable = Annotated[Row, _read_by(_readable)]
 Telecommand = Annotated[Row, _read_by(_telecommand)]
 ParameterName = Annotated[Parameter, _read_by(lambda name, icd: icd.parameters[name])]
 Refusal = Annotated[str, _read_by(lambda name, icd: _member(name, icd.enums["error_code"]))]
@@ -359,7 +367,7 @@ class Read(ReadingStep, RequestStep):
     """Read a telemetry row."""
 
     default_name = "read {self.row.name}"
-    row: Telemetry = Field(alias="read")
+    row: Readable = Field(alias="read")
 
     def run(self, session: Session, link: str) -> Attempt:
         """Read the row."""
@@ -401,7 +409,7 @@ class Sample(ReadingStep):
     """Read a telemetry row repeatedly into a CSV file."""
 
     default_name = "sample {self.row.name}"
-    row: Telemetry = Field(alias="sample")
+    row: Readable = Field(alias="sample")
     every_s: NonNegative
     for_s: NonNegative
     file: FileName = ""

@@ -374,6 +374,8 @@ class Row(RowKeys):
     """Whether fields without a binding are sent as zeros."""
     request: str = ""
     """Text that requests the row on the serial line; empty: its header does."""
+    only_sent: bool = False
+    """Whether no request reads the row: it is sent unsolicited, or as the answer of another row."""
 
     @property
     def request_size(self) -> int:

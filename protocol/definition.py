@@ -45,6 +45,12 @@ class Names(dict[str, _Item]):
         raise UnknownNameError(f"no {self._what} named {name!r}{hint}")
 
 
+SELECTING: Final = frozenset({"subscribe", "select_unsolicited"})
+"""Actions that select rows to be sent unsolicited."""
+SELECTION: Final = "unsolicited_selection"
+"""Parameter that selects a row to be sent unsolicited."""
+
+
 @dataclass(frozen=True)
 class InterfaceDefinition:
     """The interface between a device and an OBC: rows, enumerations and parameters."""
@@ -91,6 +97,18 @@ class InterfaceDefinition:
     def classes_by_name(self) -> Mapping[str, MessageClass]:
         """Classes by name."""
         return {item.name: item for item in self.classes}
+
+    @property
+    def readable(self) -> list[Row]:
+        """Telemetry that a request reads."""
+        return [row for row in self.telemetry.values() if not row.only_sent]
+
+    @cached_property
+    def selects_unsolicited(self) -> bool:
+        """Whether a telecommand or a parameter may select any telemetry row to be sent unsolicited."""
+        actions = SELECTING.union(self.plugin.actions)
+        by_command = any(row.action in actions for row in self.telecommands.values())
+        return by_command or SELECTION in self.parameters or self.plugin.skipped is not None
 
     @cached_property
     def parameters_by_id(self) -> Mapping[int, Parameter]:

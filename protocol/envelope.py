@@ -44,6 +44,7 @@ class Header:
     ) -> None:
         for number, model in enumerate(models, 1):
             _check_field(model, f"{where}: {number}")
+        self._where = where
         self.fields: Final = tuple(models)
         self.byte_order: Final = byte_order
         """Byte order of the fields that have none of their own."""
@@ -100,7 +101,7 @@ class Header:
     def pack(self, values: Mapping[str, int], klass: str, data_size: int) -> bytes:
         """Return the header of a message with `data_size` bytes of data.
 
-        Raises ProtocolError if a value does not fit its field.
+        Raises HeaderError if a value does not fit its field.
         """
         packed = b""
         for role, size, order, signed, _, default, classes, bits in self._steps:
@@ -113,8 +114,7 @@ class Header:
                     if name in WRAPPING:
                         part &= mask
                     if not 0 <= part <= mask:
-                        text = f"header: {name or 'constant'} {part} does not fit {mask.bit_length()} bits"
-                        raise ProtocolError(text)
+                        raise self._misfit(name, part, mask.bit_length())
                     value |= part << shift
             elif role is None:
                 value = default
@@ -128,9 +128,11 @@ class Header:
             try:
                 packed += value.to_bytes(size, order, signed=signed)
             except OverflowError:
-                text = f"header: {role or 'constant'} {value} does not fit {size} bytes"
-                raise ProtocolError(text) from None
+                raise self._misfit(role, value, 8 * size) from None
         return packed
+
+    def _misfit(self, role: str | None, value: int, bits: int) -> HeaderError:
+        return HeaderError(f"{self._where}: {role or 'constant'} {value} does not fit {bits} bits")
 
     def unpack(self, body: bytes, klass: str = "") -> Envelope | None:
         """Decode the header of a body of a class, if that is known; return None if the body is too short.

@@ -309,6 +309,8 @@ class _Reader:
             raise IcdError(f"last_id {last} is below ID {model.id}")
         if kind == "telecommand" and model.unsolicited is not None:
             raise IcdError("only telemetry is sent unsolicited")
+        if kind == "telecommand" and model.request is False:
+            raise IcdError("only telemetry is sent without a request; remove `request = false`")
         if kind == "telemetry" and model.readback is not None:
             raise IcdError("only telecommands have a readback")
         if model.readback is not None and not model.name.startswith(SETS):
@@ -356,6 +358,7 @@ class _Reader:
                 answers=("reply",) if answers is None else tuple(answers),
                 zeros=model.unbound is not None,
                 request=model.request or "",
+                only_sent=model.request is False,
             )
             self._add_row(row, file, complete=model.name not in self._broken)
 
@@ -483,7 +486,7 @@ def _check_link(icd: InterfaceDefinition) -> None:
 def check_text_request(row: Row, definition: InterfaceDefinition, *, needed: bool) -> None:
     """Check the text that requests a row; `needed` if requests of other rows of its format are texts."""
     if not row.request:
-        if needed:
+        if needed and not row.only_sent:
             raise IcdError("needs `request`, a text, as the other rows of its format on link.serial")
         return
     if row.kind == "telecommand" and row.size:

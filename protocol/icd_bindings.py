@@ -56,7 +56,7 @@ def _check_field(field: Field, row: Row, action: ActionModel | None, icd: Interf
 
 
 def unbound(icd: InterfaceDefinition) -> list[str]:
-    """Return an error message for each row or field that the device cannot serve, because it has no binding."""
+    """Return an error message for each row or field that the device cannot serve, because nothing gives it a value or sends it."""
     missing = [
         f"{icd.files[row.name]}: telecommand {row.name}: no `action`; use `nothing` to accept the telecommand without effect"
         for row in icd.telecommands.values()
@@ -70,6 +70,14 @@ def unbound(icd: InterfaceDefinition) -> list[str]:
         for field in row.named_fields.values()
         if (field.value, field.const, field.parameter, field.default, field.telecommand) == (None,) * 5
     ]
+    if not icd.selects_unsolicited:
+        answers = {answer for row in icd.rows for answer in row.answers}
+        missing += [
+            f"{icd.files[row.name]}: telemetry {row.name}: `request = false`, but nothing sends it; add `unsolicited`, "
+            f"or 'row:{row.name}' to the `answer` of another row"
+            for row in icd.telemetry.values()
+            if row.only_sent and row.unsolicited is None and f"row:{row.name}" not in answers
+        ]
     return missing
 
 

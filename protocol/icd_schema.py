@@ -191,8 +191,9 @@ class RowModel(RowKeys):
     telecommand is `set_NAME`, the telemetry row is `NAME`."""
     answer: list[str] | None = None
     """Answers, in order: `echo`, `reply`, `row:NAME`; default: the answers of the class."""
-    request: LineText | None = None
-    """Text that requests the row on the serial line, instead of header and data; the ID then stands only in exports and logs."""
+    request: LineText | Literal[False] | None = None
+    """Text that requests the row on the serial line, instead of header and data; the ID then stands only in exports and logs.
+    `false`: the telemetry row is only sent, and no request reads it."""
 
 
 class ParameterModel(DefinitionModel):

@@ -126,7 +126,7 @@ class Formats:
         where = f"link.serial.format: {direction}"
         if any(not form.classes for form in self.all[:-1]):
             raise IcdError(f"{where}: a format after one without `classes` fits no message")
-        starts: dict[int | None, str] = {}
+        starts: dict[int | None, MessageFormat] = {}
         for form in self.all if len(self.all) > 1 else ():
             if form.model.kind not in ("length", "fixed", "delimited"):
                 raise IcdError(
@@ -134,9 +134,12 @@ class Formats:
                 )
             start = _first_byte(form)
             if start in starts:
-                same = "no start" if start is None else f"a start with {start:02X}"
-                raise IcdError(f"{where}: several framings have {same}; their first bytes must differ")
-            starts[start] = form.model.kind
+                same = "have no `start`" if start is None else f"start with {start:02X}"
+                both = " and ".join(f"{item.model.kind} of {_whose(item)}" for item in (starts[start], form))
+                raise IcdError(
+                    f"{where}: framings {both} {same}; give them different first bytes, or formats a `direction`"
+                )
+            starts[start] = form
 
     def of(self, klass: str) -> MessageFormat:
         """Return the format of the messages of a class."""
@@ -181,6 +184,10 @@ class _FirstByteDeframer(Deframer[_Message]):
 
     def flush(self, now: float) -> list[LinkFault]:
         return self._current.flush(now)
+
+
+def _whose(form: MessageFormat) -> str:
+    return f"class {' and '.join(form.classes)}" if form.classes else "all other messages"
 
 
 def _first_byte(form: MessageFormat) -> int | None:

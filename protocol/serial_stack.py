@@ -108,14 +108,28 @@ class SerialStack:
         self.max_size: Final = link.max_size or max(DEFAULT_MAX_SIZE, longest)
 
     def _formats_of(self, direction: str, models: Sequence[HeaderFieldModel]) -> Formats:
+        """Return the formats of a direction; one of classes that have no messages in it is left out."""
         found = []
+        names = {*self.classes} or {""}
+        left = {name for name in names if self._has_messages(name, direction, models)}
         for number, item in enumerate(self.link.format, 1):
             self._check_format(item, f"link.serial.format {number}")
-            if item.direction in (None, direction):
+            used = item.classes is None or not left.isdisjoint(item.classes)
+            if item.direction in (None, direction) and used:
                 found.append(self._format(f"{direction}_header", models, item))
-        if all(form.classes for form in found):
+                left.difference_update(item.classes or ())
+        if not found or (left and all(form.classes for form in found)):
             found.append(self._format(f"{direction}_header", models))
         return Formats(found, direction)
+
+    def _has_messages(self, klass: str, direction: str, models: Sequence[HeaderFieldModel]) -> bool:
+        """Return whether there are requests, or replies and refusals, of rows of a class."""
+        rows = [row for row in self.rows if row.klass == klass]
+        if direction == "request":
+            return not rows or any(not row.only_sent for row in rows)
+        roles = {role for model in models if model.in_class(klass) for role in model.by_role}
+        refused = bool(roles & {"status", "ack"}) or self.link.refusal is not None
+        return refused or not rows or any(row.answers or row.kind is RequestKind.TELEMETRY for row in rows)
 
     def _check_format(self, item: FormatModel, where: str) -> None:
         if item.framing is None and item.check is None:
@@ -193,6 +207,12 @@ class SerialStack:
         """Return whether this dialect has unsolicited telemetry."""
         replies = self.in_dialect(dialect)
         return replies is None or ReplyKind.UNSOLICITED in replies.headers
+
+    def marks_unsolicited(self, klass: str) -> bool:
+        """Return whether unsolicited telemetry of a class differs from an answer by more than that nothing requested it."""
+        item = self.classes.get(klass)
+        codes = item is not None and item.code is not None and item.unsolicited_code != item.reply_code
+        return bool(self.dialects) or codes
 
     def counts(self, kind: ReplyKind) -> bool:
         """Return whether the device numbers messages of this kind itself."""

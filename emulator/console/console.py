@@ -296,8 +296,8 @@ class Console:
         begins, viewer.wire = not viewer.wire, bool(request.get("wire"))
         if begins and viewer.wire:
             viewer.send(json.dumps({"type": "wire", "lines": self.trace.recent(), "left_out": 0}))
-        known = self._head.device.icd.telemetry
-        viewer.rows = frozenset(name for name in rows if name in known)
+        known = frozenset(row.name for row in self._head.device.icd.readable)
+        viewer.rows = known.intersection(rows)
         self._viewers_changed()
         return {}
 

@@ -50,7 +50,7 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
         "camera": head.warm.camera if head.warm is not None else head.profile.camera.values(),
         "unit": {"name": icd.name, "version": icd.version},
         "telecommands": [describe_row(row, icd) for row in icd.rows if row.kind == "telecommand"],
-        "telemetry": [describe_row(row, icd) for row in icd.rows if row.kind == "telemetry"],
+        "telemetry": [describe_row(row, icd) for row in sorted(icd.readable, key=lambda row: row.id)],
         "parameters": [
             {"id": item.id, "name": item.name, "unit": item.unit, "min": item.minimum, "max": item.maximum}
             for item in icd.parameters.values()

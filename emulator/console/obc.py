@@ -179,6 +179,8 @@ class ConsoleObc:
         rows = self._icd.telecommands if kind == "telecommand" else self._icd.telemetry
         if name not in rows:
             raise EmulatorError(f"{escape_controls(name)}: no such {kind}")
+        if rows[name].only_sent:
+            raise EmulatorError(f"{name}: is only sent, and no request reads it")
         return rows[name]
 
     def session(self, title: str) -> str:

@@ -36,7 +36,9 @@ class Requests:
         self.telecommand_bindings = {
             row.name: TelecommandBinding(row, icd) for row in icd.telecommands.values()
         }
-        self._telemetry_rows = {(row.klass, row.id): row for row in icd.telemetry.values()}
+        self._telemetry_rows = {
+            (row.klass, row.id): row for row in icd.telemetry.values() if not row.only_sent
+        }
         self._telecommand_rows = {(row.klass, row.id): row for row in icd.telecommands.values()}
         serial = icd.link.serial
         self._stamped = serial is not None and any(

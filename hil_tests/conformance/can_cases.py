@@ -10,7 +10,7 @@ from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.case import Case, case_in, rule
 from starhil.hil_tests.conformance.case_file import CUBESPACE_CASES, text_cases
 from starhil.hil_tests.conformance.ports import CanFrame
-from starhil.hil_tests.conformance.row_cases import row_cases
+from starhil.hil_tests.conformance.row_cases import row_cases, sent_cases
 from starhil.hil_tests.judge.can import can_id_of, segments
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import PUBLISHED
@@ -23,6 +23,9 @@ LONGEST: Final = 56
 
 def can_cases(unit: Unit) -> Iterator[Case[Any]]:
     """Yield the cases for a unit with a CAN link."""
+    if not unit.readable:
+        yield from sent_cases(unit)
+        return
     yield from text_cases(CUBESPACE_CASES, "can", can_names(unit))
     yield from row_cases(unit)
     yield case_in("recovery", "noise", "after noise the next valid request is answered", noise, rule(9))
@@ -37,7 +40,8 @@ def can_names(unit: Unit) -> dict[str, str]:
     `unknown_telemetry`. `single_size`, `single_data`: size and data, which for telemetry are any. `m0` to `m4`: segments of
     a message that is answered by `refusal`, and `t0` to `t4` from another host. Each error has its code.
     """
-    telemetry, commands = unit.telemetry.values(), unit.telecommands.values()
+    telemetry = [row for row in unit.readable.values() if row.answers == ("reply",)]
+    commands = [row for row in unit.telecommands.values() if row.answers == ("reply",)]
     shown = [row for row in telemetry if 8 < row.size <= LONGEST]
     faulty = {row.id: data for row in commands for data in _bad_data(row)[:1] if row.size <= 8}
     rows: dict[str, Iterable[Row]] = {

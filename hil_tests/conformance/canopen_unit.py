@@ -21,7 +21,9 @@ from starhil.hil_tests.conformance.canopen_probe import (
     CanopenProbe,
 )
 from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal
+from starhil.hil_tests.conformance.clock_cases import PAUSE_S, Time, check_times, passage_of, times_of
 from starhil.hil_tests.conformance.row_cases import CLOCK_S
+from starhil.hil_tests.conformance.unjudged_cases import stated, unjudged_cases
 from starhil.hil_tests.judge.canopen import (
     EXPEDITED,
     SYNC,
@@ -51,7 +53,8 @@ def canopen_unit_cases(unit: Unit) -> list[Case[CanopenProbe]]:
     """Return the cases for a unit with CANopen."""
     layout = unit.canopen
     found = list(entries(unit, layout))
-    return [*_rows(unit, found), *_commands(found), *_records(found), *_limits(found), *_pdos(layout, found)]
+    cases = [*_rows(unit, found), *_commands(found), *_records(found), *_limits(found), *_pdos(layout, found)]
+    return [*cases, *unjudged_cases(unit, _unjudged(unit, found))]
 
 
 def _case(
@@ -79,6 +82,36 @@ def _rows(unit: Unit, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
         yield _case("rows", row.name, title, partial(_values, row, attitude), row, safe=True)
         if attitude is not None:
             yield _case("attitude", row.name, attitude.title, attitude.becomes_valid, row)
+        times = _times(row, fields)
+        if times:
+            title = f"times in the entries of {row.name} advance as the tester's clock does"
+            yield _case(
+                "clocks",
+                row.name,
+                title,
+                partial(_clocks, row, times, unit.conventions.epoch),
+                row,
+                safe=True,
+            )
+
+
+def _times(row: Row, fields: list[Field]) -> list[Time]:
+    """Return the times that are one entry each: two are not read at one moment."""
+    found = [time for time in times_of(row) if not time.of_frame and len(time.fields) == 1]
+    return [time for time in found if time.fields[0] in fields]
+
+
+def _clocks(row: Row, times: list[Time], epoch: str, probe: CanopenProbe) -> None:
+    check_times(row, times, passage_of(probe, row, partial(probe.sleep, PAUSE_S)), epoch)
+
+
+def _unjudged(unit: Unit, found: list[Entry]) -> Iterator[tuple[Row, Field]]:
+    """Yield the fields of entries that no case judges."""
+    for row in unit.telemetry.values():
+        read = {slot.offset for _, slot in slots(row, found)}
+        fields = [item for item in row.named.values() if item.offset in read]
+        judged = [*stated(unit, row), *(item for time in _times(row, fields) for item in time.fields)]
+        yield from ((row, item) for item in fields if item not in judged)
 
 
 def _values(row: Row, attitude: AttitudeRow | None, probe: CanopenProbe) -> None:

@@ -6,12 +6,13 @@ The judge (`starhil.hil_tests.judge`) encodes and decodes; a probe adds the port
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final, Protocol
 
-from starhil.hil_tests.conformance.case import CaseFailed, Probe, check, check_equal
+from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, Probe, check, check_equal
 from starhil.hil_tests.conformance.ports import Port
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request, Value
@@ -31,6 +32,8 @@ LONG_PAUSE_S: Final = 0.8
 """Pause after which the device has abandoned an incomplete message (after 0.5 s)."""
 LATE_S: Final = 1.0
 """Time after the time-out in which an answer is still taken, to be named as late."""
+FRAME_S: Final = 10.0
+"""Longest time from one measurement to the next."""
 RECOVERY_S: Final = 1.0
 """Pause after a failed case, in which time-outs of the device pass."""
 SHOWING: Final = 8
@@ -99,7 +102,7 @@ def lively_row(unit: Unit, can_refuse: Callable[[str], bool]) -> Row:
     def unsuitable(row: Row) -> tuple[bool, bool, bool, int]:
         return row.action is not None, not can_refuse(row.klass), row.size < SHOWING, row.size
 
-    return min(unit.telemetry.values(), key=unsuitable)
+    return min(unit.readable.values(), key=unsuitable)
 
 
 class LinkProbe(Probe):
@@ -115,6 +118,8 @@ class LinkProbe(Probe):
     """How many numbers the header has for messages; 0 if it has none."""
     has_codes = True
     """Whether a refusal carries a code."""
+    names_rows = True
+    """Whether an answer names its row."""
 
     def __init__(
         self, port: Port[Any], unit: Unit, times: ProbeTimes | None, settings: Settings | None = None
@@ -172,6 +177,11 @@ class LinkProbe(Probe):
     def _unsolicited_answers(self) -> list[Answer]:
         """Return the messages in `unsolicited`."""
 
+    @contextmanager
+    def streaming(self, rows: Iterable[Row]) -> Iterator[None]:  # noqa: ARG002 -- where messages say it themselves
+        """Take messages of these rows that no request awaits for unsolicited telemetry."""
+        yield
+
     def check_numbers(self, answers: Sequence[Answer]) -> None:
         """Fail the case unless the numbers that the unit has given successive messages are successive."""
         seen = [answer.number for answer in answers if answer.number is not None]
@@ -212,17 +222,40 @@ class LinkProbe(Probe):
         return self.unit.telecommands.values()
 
     def telemetry_rows(self) -> Iterable[Row]:
-        """Return the telemetry of the unit."""
-        return self.unit.telemetry.values()
+        """Return the telemetry of the unit that can be read: by a request, or by waiting for it."""
+        return (row for row in self.unit.telemetry.values() if not row.only_sent or row.is_streamed)
 
     def post(self, row: Row | int, data: bytes = b"", klass: str = "") -> None:
         """Send a request for a row, or for an ID that need not belong to one, without waiting."""
         self.post_request(self.unit.request(row, data, klass))
 
     def ask(self, row: Row | int, data: bytes = b"", klass: str = "") -> Answer:
-        """Send a request and return the answer; of an answer in several parts, the last."""
+        """Send a request and return the answer; of an answer in several parts, the last.
+
+        Other rows that answer a request follow its reply, or stand for it.
+        """
+        others = []
+        if isinstance(row, Row):
+            named = [item.partition(":")[2] for item in self.answers(row)]
+            others = [self.unit.telemetry[name] for name in named if name]
+        if others and not self.names_rows:
+            raise CaseSkipped(f"on this link an answer does not name its row, such as {others[0].name}")
         self.post(row, data, klass)
-        return self.last_answer()
+        answer = self.last_answer()
+        if not isinstance(row, Row) or not others or answer.kind not in ("ack", "telemetry"):
+            return answer
+        if answer.row_id != row.id and "reply" not in self.answers(row):
+            self._check_row(others.pop(0), answer)
+            answer = replace(answer, kind="ack", row_id=row.id, klass=row.klass)
+        for other in others:
+            self._check_row(other, self.next_answer())
+        return answer
+
+    def _check_row(self, row: Row, answer: Answer) -> None:
+        named = answer.row_id in (None, row.id)
+        if answer.kind != "telemetry" or len(answer.data) != row.size or not named:
+            raise CaseFailed(f"row {row.name} ({row.id}) of {row.size} bytes as an answer", str(answer))
+        checked_values(row, answer.data)
 
     def last_answer(self) -> Answer:
         """Return the next answer; of one in several parts, the last."""
@@ -231,9 +264,25 @@ class LinkProbe(Probe):
         return answer
 
     def data_of(self, row: Row) -> bytes:
-        """Read the bytes of a row; any other answer fails the case."""
+        """Read the bytes of a row, or wait for one that is only sent; any other answer fails the case."""
+        if row.only_sent:
+            return self._awaited(row).data
         self.post(row)
         return self.expect_telemetry(row).data
+
+    def _awaited(self, row: Row) -> Answer:
+        """Return the next message of a row that is sent at a rate or with each frame."""
+        if not (row.is_streamed and self.has_unsolicited):
+            raise CaseSkipped(f"{row.name} is only sent, and not regularly on this link")
+        period_s = 1.0 / row.unsolicited if isinstance(row.unsolicited, float) else FRAME_S
+        end = self.now() + period_s + self.times.answer_s
+        self.unsolicited.clear()
+        while self.now() < end:
+            self._receive(end - self.now())
+            for answer in self._unsolicited_answers():
+                if (answer.row_id, answer.klass) == (row.id, row.klass) and len(answer.data) == row.size:
+                    return answer
+        raise CaseFailed(f"{row.name} ({row.id}) of {row.size} bytes within {period_s:g} s", "nothing")
 
     def expect_telemetry(self, row: Row, timeout_s: float | None = None) -> Answer:
         """Take the next answer, which must be the telemetry of a row."""
@@ -275,7 +324,7 @@ class LinkProbe(Probe):
         request = self.unit.request(row, data, klass)
         known = self.unit.row(request)
         what = f"{request} ({known.name})" if known is not None else str(request)
-        if not self.can_refuse(request.klass) or (known is not None and not self.answers(known)):
+        if not self.can_refuse(request.klass) or (known is not None and "reply" not in self.answers(known)):
             self.post_request(request, answered=False)
             self.expect_silence(f"no answer can express the refusal of {what} on this link")
             self.check_reported(request.id, error)
@@ -301,7 +350,7 @@ class LinkProbe(Probe):
             "request.error": error,
             "request.index": index,
         }
-        for row in self.unit.telemetry.values():
+        for row in self.unit.readable.values():
             named = {item.value: name for name, item in row.named.items() if item.value in REPORTED}
             if "request.error" not in named:
                 continue
@@ -359,7 +408,7 @@ class LinkProbe(Probe):
     def identity(self) -> str:
         """Return what the unit reports of its identity; empty if no row does."""
         found: dict[str, Value] = {}
-        for row in self.unit.telemetry.values():
+        for row in self.unit.readable.values():
             names = [name for name, item in row.named.items() if (item.value or "").startswith("identity.")]
             found |= {
                 name: value
@@ -373,8 +422,10 @@ class LinkProbe(Probe):
 
         If the unit may be booting, the requests are repeated until it must have booted.
         """
-        rows = sorted(self.unit.telemetry.values(), key=lambda row: row.size)[:3]
+        rows = sorted(self.unit.readable.values(), key=lambda row: row.size)[:3]
         end = self.now() + (self.times.boot_s if booting else 0.0)
+        if not rows:
+            return None if self.receive_unsolicited(FRAME_S) else "nothing"
         while True:
             seen = [answer for row in rows if (answer := self._bad_answer(row)) is not None]
             if len(seen) < len(rows):

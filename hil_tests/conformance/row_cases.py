@@ -17,7 +17,9 @@ from starhil.hil_tests.conformance.attitude_cases import (
     mode_command,
 )
 from starhil.hil_tests.conformance.case import Case, CaseSkipped, case_in, check, check_equal, rule
+from starhil.hil_tests.conformance.clock_cases import clock_cases
 from starhil.hil_tests.conformance.link_probe import (
+    FRAME_S,
     INVALID_ID,
     INVALID_LENGTH,
     INVALID_PARAMETER,
@@ -25,6 +27,7 @@ from starhil.hil_tests.conformance.link_probe import (
     changes_link,
     checked_values,
 )
+from starhil.hil_tests.conformance.unjudged_cases import unjudged_cases, unjudged_fields
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Value
 from starhil.hil_tests.judge.rows import Field, Row
@@ -49,20 +52,30 @@ PUBLISHED_IDS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc,
 Run = Callable[[LinkProbe], None]
 
 
+ANY_SIZE: Final = range(1 << 16)
+
+
 def row_cases(
-    unit: Unit, *, lengths: bool = True, numbers: bool = True, marks: bytes = b"", highest_id: int = 255
+    unit: Unit,
+    *,
+    lengths: bool = True,
+    numbers: bool = True,
+    marks: bytes = b"",
+    highest_id: int = 255,
+    sizes: Callable[[str], range] = lambda _klass: ANY_SIZE,
 ) -> Iterator[Case[LinkProbe]]:
     """Yield the cases for the rows of a unit.
 
     `lengths`: whether a message of a wrong length can be sent on the link. `numbers`: whether requests carry IDs. `marks`: bytes that are special on it, of which settings
-    are made. `highest_id`: the highest that a message can carry.
+    are made. `highest_id`: the highest that a message can carry. `sizes`: the numbers of bytes of data that a request of a class can have.
     """
     if numbers:
-        yield from _identifiers(unit, highest_id)
+        yield from _identifiers(unit, highest_id, sizes)
     if lengths:
-        yield from _lengths(unit)
+        yield from _lengths(unit, sizes)
     for row in unit.telemetry.values():
-        yield from _telemetry(unit, row)
+        if not row.only_sent or row.is_streamed:
+            yield from _telemetry(unit, row)
     for row in unit.telecommands.values():
         for index, (name, item) in enumerate(row.named.items()):
             for why, data in row.bad_values(item):
@@ -71,17 +84,35 @@ def row_cases(
                 yield case_in("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
     yield from _agreement(unit)
     yield from _settings(unit, marks)
+    yield from clock_cases(unit)
     yield from _unsolicited(unit)
     yield from _subscriptions(unit)
+    yield from unjudged_cases(unit, unjudged_fields(unit, _compared(unit)))
     yield case_in(
         "recovery", "flood", "a flood of requests is answered completely and in order", _flood, rule(10)
     )
 
 
+def sent_cases(unit: Unit) -> Iterator[Case[LinkProbe]]:
+    """Yield the cases for a unit none of whose telemetry a request reads: those of the rows that it sends by itself."""
+    for row in unit.telemetry.values():
+        if row.is_streamed:
+            yield from _telemetry(unit, row)
+    yield from clock_cases(unit)
+    yield from _unsolicited(unit)
+
+    def requests(_probe: LinkProbe) -> None:
+        raise CaseSkipped("no request reads a row, so that no case can see whether a request was taken")
+
+    yield from unjudged_cases(unit, unjudged_fields(unit, ()))
+    title = "framing, check, header, IDs, lengths and values of requests"
+    yield case_in("unjudged", "requests", title, requests, "[[telemetry]]: `request = false` in all rows")
+
+
 # --- row IDs ---
 
 
-def _identifiers(unit: Unit, highest: int) -> Iterator[Case[LinkProbe]]:
+def _identifiers(unit: Unit, highest: int, sizes: Callable[[str], range]) -> Iterator[Case[LinkProbe]]:
     """Yield a case for each class, or for each kind where IDs tell them apart."""
     groups: dict[str, tuple[str, range]] = {
         item.name: (item.name, range(highest + 1)) for item in unit.classes if item.code is not None
@@ -90,7 +121,7 @@ def _identifiers(unit: Unit, highest: int) -> Iterator[Case[LinkProbe]]:
         first = unit.first_telemetry_id
         groups = {"telemetry": ("", range(first, highest + 1)), "telecommands": ("", range(first))}
     for name, (klass, numbers) in (groups or {"unknown": ("", range(highest + 1))}).items():
-        known = {row.id for row in unit.rows if row.klass == klass or not klass}
+        known = {row.id for row in unit.rows if not row.only_sent and (row.klass == klass or not klass)}
         unknown = [number for number in numbers if number not in known]
         if klass:  # every class has all numbers: those beside its rows, and both ends
             near = {row_id + step for row_id in known for step in (-1, 1)} | {0, highest}
@@ -98,15 +129,15 @@ def _identifiers(unit: Unit, highest: int) -> Iterator[Case[LinkProbe]]:
 
         def run(probe: LinkProbe, klass: str = klass, unknown: list[int] = unknown) -> None:
             for row_id in unknown:
-                probe.expect_refusal(row_id, b"", INVALID_ID, klass)
+                probe.expect_refusal(row_id, bytes(sizes(klass)[0]), INVALID_ID, klass)
 
         title = f"unknown {'IDs of class ' + klass if klass else 'IDs' if name == 'unknown' else name} are refused"
         yield case_in("identifiers", name, title, run, PUBLISHED_IDS, intrusive=name != "telemetry")
 
 
-def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
+def _lengths(unit: Unit, sizes: Callable[[str], range]) -> Iterator[Case[LinkProbe]]:
     def with_data(probe: LinkProbe) -> None:
-        for row in probe.unit.telemetry.values():
+        for row in probe.unit.readable.values():
             if probe.distinguishes_refusal(row):
                 probe.expect_refusal(row, b"\x00", INVALID_LENGTH)
 
@@ -121,7 +152,7 @@ def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
             "empty": b"" if row.size > 1 else None,
         }
         for why, data in tried.items():
-            if data is not None:
+            if data is not None and len(data) in sizes(row.klass):
                 title = f"{row.name} with {len(data)} bytes ({why}) is refused for its length"
                 run = partial(_refused, row, data, INVALID_LENGTH, None)
                 yield case_in("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
@@ -156,21 +187,14 @@ def _telemetry(unit: Unit, row: Row) -> Iterator[Case[LinkProbe]]:
 
 def _agreement(unit: Unit) -> Iterator[Case[LinkProbe]]:
     """Yield the case for numbers that several fields report: the layouts differ, the values must not."""
-    places: dict[tuple[str, str], list[tuple[Row, str]]] = {}
-    for row in unit.telemetry.values():
-        for name, item in row.named.items():
-            if item.value is not None and item.kind in ("integer", "float", "bits") and item.enum is None:
-                places.setdefault((item.value, item.unit), []).append((row, name))
-    shared = {
-        quantity: found for quantity, found in places.items() if len({_layout(*place) for place in found}) > 1
-    }
+    shared = _shared(unit)
     if not shared:
         return
 
     def run(probe: LinkProbe) -> None:
         with identifying_stars(probe):
             probe.sleep(SETTLING_S)
-            for (quantity, _unit), (first, *others) in shared.items():
+            for quantity, (first, *others) in shared.items():
                 for other in others:
                     _compare(probe, quantity, first, other)
 
@@ -178,6 +202,28 @@ def _agreement(unit: Unit) -> Iterator[Case[LinkProbe]]:
     yield case_in(
         "agreement", "rows", title, run, "[[telemetry]]: fields with the same `value`", intrusive=True
     )
+
+
+def _shared(unit: Unit) -> dict[str, list[tuple[Row, str]]]:
+    """Return the fields of each quantity that several layouts report in one unit of measure."""
+    places: dict[tuple[str, str], list[tuple[Row, str]]] = {}
+    for row in unit.readable.values():
+        for name, item in row.named.items():
+            if item.value is not None and item.kind in ("integer", "float", "bits") and item.enum is None:
+                places.setdefault((item.value, item.unit), []).append((row, name))
+    return {
+        quantity: found
+        for (quantity, _unit), found in places.items()
+        if len({_layout(*place) for place in found}) > 1
+    }
+
+
+def _compared(unit: Unit) -> Iterator[tuple[Row, str]]:
+    """Yield the fields that are compared with what was set, or with other fields."""
+    for places in _shared(unit).values():
+        yield from places
+    for _, row, names in _read_back(unit):
+        yield from ((row, name) for name in names.values())
 
 
 def _layout(row: Row, name: str) -> tuple[object, ...]:
@@ -220,16 +266,24 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
         if row.action in (None, "nothing") or row.action in own:
             title = f"{row.name} is accepted"
             yield case_in("commands", row.name, title, partial(_accepted, row), row, intrusive=True)
-    for command, row, places in unit.reported:
+    for command, row, places in _read_back(unit):
         run = partial(_set_and_read, command, row, places, marks)
         name = f"{row.name}.{command.name}"
-        if command.action == "set_parameters" and not changes_link(unit, command):
+        if command.action == "set_parameters":
             title = f"{row.name} reports the parameters set by {command.name}"
             yield case_in("settings", name, title, run, row, intrusive=True)
-        elif command.action in (None, "nothing"):
+        else:
             title = f"{row.name} reports the bytes set by {command.name}"
             alone = sum(other is row for _, other, _ in unit.reported) == 1
             yield case_in("settings", row.name if alone else name, title, run, row, intrusive=True)
+
+
+def _read_back(unit: Unit) -> Iterator[tuple[Row, Row, Mapping[str, str]]]:
+    """Yield the telecommands whose values cases set and read, as `Unit.reported` has them."""
+    for command, row, places in unit.reported:
+        kept = command.action == "set_parameters" and not changes_link(unit, command)
+        if kept or command.action in (None, "nothing"):
+            yield command, row, places
 
 
 def _accepted(row: Row, probe: LinkProbe) -> None:
@@ -343,6 +397,8 @@ def _reported(row: Row, probe: LinkProbe) -> None:
     _check_carried(probe)
     rest, search = mode_command(probe, STANDBY), mode_command(probe, SEARCHING)
     if rest is None or search is None:
+        if row.is_streamed and _of_row(row, probe.receive_unsolicited(FRAME_S)):
+            return
         raise CaseSkipped("no telecommand starts and ends the identification of stars")
     with identifying_stars(probe):
         rest()
@@ -393,6 +449,12 @@ def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
 
 
 def _subscribed(command: Row, fields: list[str], offered: list[Row], probe: LinkProbe) -> None:
+    _check_carried(probe)
+    with probe.streaming(offered):
+        _subscribe(command, fields, offered, probe)
+
+
+def _subscribe(command: Row, fields: list[str], offered: list[Row], probe: LinkProbe) -> None:
     none = dict.fromkeys(fields, 0)
 
     def of_list(seconds: float) -> list[Answer]:
@@ -417,7 +479,7 @@ def _subscribed(command: Row, fields: list[str], offered: list[Row], probe: Link
 
 
 def _flood(probe: LinkProbe) -> None:
-    rows = sorted(probe.unit.telemetry.values(), key=lambda row: row.size)[:2]
+    rows = sorted(probe.unit.readable.values(), key=lambda row: row.size)[:2]
     for number in range(FLOOD):
         probe.post(rows[number % len(rows)])
     for number in range(FLOOD):

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, Probe
 from starhil.hil_tests.errors import BenchError, LinkLostError
+from starhil.hil_tests.judge.headers import InexpressibleError
 from starhil.hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED
 from starhil.protocol.errors import ProtocolError
 
@@ -117,6 +118,8 @@ def _attempt(probe: Probe, act: Callable[[], T]) -> tuple[T | None, Ending]:
         failure = CaseFailed("a case that can be carried out", str(error))
         failure.__cause__ = error
         return None, failure
+    except InexpressibleError as error:
+        return None, CaseSkipped(f"no message of this link can express what the case sends: {error}")
     except (LookupError, ValueError) as error:
         last = next((line for line in reversed(probe.log) if " <- " in line), "nothing")
         seen = f"{last.partition(' <- ')[2] or last} ({type(error).__name__}: {error})"

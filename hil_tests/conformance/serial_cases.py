@@ -22,8 +22,8 @@ from starhil.hil_tests.conformance.case import (
     rule,
 )
 from starhil.hil_tests.conformance.case_file import CUBESPACE_CASES, text_cases
-from starhil.hil_tests.conformance.link_probe import INVALID_ID, lively_row
-from starhil.hil_tests.conformance.row_cases import CLOCK_S, row_cases
+from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH, lively_row
+from starhil.hil_tests.conformance.row_cases import CLOCK_S, row_cases, sent_cases
 from starhil.hil_tests.conformance.serial_probe import BITS_A_BYTE, SerialProbe
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.framings import Framing
@@ -45,6 +45,9 @@ Run = Callable[[SerialProbe], None]
 def serial_cases(unit: Unit) -> Iterator[Case[Any]]:
     """Yield the cases for a unit with a serial link."""
     line = SerialLine(unit)
+    if not unit.readable:
+        yield from sent_cases(unit)
+        return
     lively = lively_row(unit, line.envelope.can_refuse)
     framing, envelope = line.request_format(lively.klass)
     yield from _framing(line, framing, in_text=bool(lively.request))
@@ -69,6 +72,7 @@ def serial_cases(unit: Unit) -> Iterator[Case[Any]]:
         numbers=not texts,
         marks=framing.marks,
         highest_id=highest,
+        sizes=envelope.data_sizes,
     )
     yield case_in("recovery", "noise", "after noise and a pause the next request is answered", noise, rule(9))
 
@@ -134,10 +138,14 @@ def _framing(line: SerialLine, framing: Framing, *, in_text: bool) -> Iterator[C
     def overlong(probe: SerialProbe) -> None:
         size = probe.unit.serial.max_size or max(DEFAULT_MAX_SIZE, *(row.size for row in probe.unit.rows))
         request = probe.unit.request(probe.lively)
+        envelope = probe.line.request_format(request.klass)[1]
         if in_text:
             probe.send(framing.encode(_body(probe) + plain[:1] * (size + 64)))
-        else:
+        elif size + 64 in envelope.data_sizes(request.klass):
             probe.send(probe.line.encode(replace(request, data=plain[:1] * (size + 64))))
+        else:  # the longest message that its length field can state is not too long, but longer than the row
+            longest = envelope.data_sizes(request.klass)[-1]
+            probe.expect_refusal(probe.lively, plain[:1] * longest, INVALID_LENGTH)
         probe.expect_silence("the message was too long")
         probe.sleep_past_timeout()
         probe.expect_alive()
@@ -172,7 +180,7 @@ def serial_names(unit: Unit) -> dict[str, str]:
     `row`, `other`, `lively`: ID of telemetry in hexadecimal, `row_id` decimal; `read`: CubeSpace's request for `row`; `no_row_31`:
     the ID 31, if no row has it.
     """
-    small = sorted(unit.telemetry.values(), key=lambda row: row.size)[:2]
+    small = sorted(unit.readable.values(), key=lambda row: row.size)[:2]
     lively = lively_row(unit, SerialLine(unit).envelope.can_refuse)
     found: dict[str, str] = {}
     for name, row in (("row", small[0]), ("other", small[-1]), ("lively", lively)):
@@ -304,7 +312,7 @@ def _silent_header(envelope: Headed, name: str, item: Any, values: list[int], wh
         header = _body(probe)[: envelope.requests.size(klass)]
         offset, size = envelope.requests.place(item, klass)
         for value in values:
-            piece = value.to_bytes(size, item.order or probe.unit.conventions.byte_order)
+            piece = (value % (1 << 8 * size)).to_bytes(size, item.order or probe.unit.conventions.byte_order)
             changed = header[:offset] + piece + header[offset + size :]
             probe.send(probe.line.request_format(klass)[0].encode(envelope.closed(changed, b"")))
         probe.expect_silence(what)
@@ -315,7 +323,7 @@ def _silent_header(envelope: Headed, name: str, item: Any, values: list[int], wh
 
 
 def _clock(unit: Unit, replies: Header) -> Iterator[Case[SerialProbe]]:
-    row = next((row for row in unit.telemetry.values() if "time" in replies.roles(row.klass)), None)
+    row = next((row for row in unit.readable.values() if "time" in replies.roles(row.klass)), None)
     for command in unit.telecommands.values():
         names = {item.argument: name for name, item in command.named.items()}
         if command.action == "set_clock" and "microseconds" in names and row is not None:
@@ -362,7 +370,7 @@ def _echoed(row: Row, probe: SerialProbe) -> None:
 def pace(probe: SerialProbe) -> None:
     if probe.baud is None:
         raise CaseSkipped("the pace is checked only with --baud, the bit rate of the line")
-    row = max(probe.unit.telemetry.values(), key=lambda row: row.size)
+    row = max(probe.unit.readable.values(), key=lambda row: row.size)
     begin = probe.now()
     probe.post(row)
     probe.expect_telemetry(row)

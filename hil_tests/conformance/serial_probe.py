@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Final
 
 from starhil.hil_tests.conformance.link_probe import LinkProbe, ProbeTimes, Settings
@@ -47,6 +48,7 @@ class SerialProbe(LinkProbe):
         self.baud = baud
         self.has_unsolicited = self.line.envelope.has_unsolicited
         self.has_codes = self.line.envelope.has_codes
+        self.names_rows = self.line.envelope.names_rows
         self.numbers = self.line.envelope.numbers
         self.raw = b""
         self.sent = b""
@@ -108,6 +110,16 @@ class SerialProbe(LinkProbe):
     def answers(self, row: Row) -> Sequence[str]:
         """Return the answers of a row on the serial line."""
         return self.unit.serial_answers(row)
+
+    @contextmanager
+    def streaming(self, rows: Iterable[Row]) -> Iterator[None]:
+        """Take messages of these rows that no request awaits for unsolicited telemetry."""
+        before = self.line.streamed
+        self.line.streamed = before.union((row.klass, row.id) for row in rows)
+        try:
+            yield
+        finally:
+            self.line.streamed = before
 
     def can_refuse(self, klass: str) -> bool:
         """Return whether answers of a class can express a refusal."""

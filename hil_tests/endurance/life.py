@@ -159,7 +159,7 @@ class LifeGenerator:
         self._definition = definition
         self._links = links
         self._random = random_of_life
-        self._telemetry = list(definition.telemetry.values())
+        self._telemetry = list(definition.readable.values())
         self._telecommands = list(definition.telecommands.values())
         self._attitude_rows = [
             row for row in self._telemetry if any(field.value == "attitude.valid" for field in row.fields)

@@ -160,7 +160,7 @@ class Oracle:
     def verdict(self, row: Row | None, request: Request) -> str | None:
         """Return "ok" if a request must be accepted, the error with which it must be refused, or None: either."""
         data = request.data
-        if row is None:
+        if row is None or row.only_sent:
             return "invalid_id"
         if request.telemetry:
             images = any((field.value or "").startswith(("image.", "file.")) for field in row.named.values())

@@ -160,7 +160,7 @@ class LifeRun:
                 await self._obc.request(self._unit.links[0], (row.klass, row.id, row.kind), data.hex())
                 break
         await self._obc.pass_time(RECOVERY_S)
-        for row in self._definition.telemetry.values():
+        for row in self._definition.readable.values():
             valid = [field for field in row.named.values() if field.value == "attitude.valid"]
             if valid:
                 await self._obc.expect_valid(row, valid[0].name, RECOVERY_S)

@@ -101,6 +101,11 @@ class Unit:
         return tuple(row for table in tables for row in sorted(table.values(), key=lambda row: row.id))
 
     @cached_property
+    def readable(self) -> Mapping[str, Row]:
+        """Telemetry that a request reads, by name."""
+        return {name: row for name, row in self.telemetry.items() if not row.only_sent}
+
+    @cached_property
     def parameters_by_id(self) -> Mapping[int, Parameter]:
         """Parameters that the unit exposes, by ID."""
         return {item.id: item for item in self.parameters.values()}
@@ -137,7 +142,7 @@ class Unit:
         The row includes the fields of the telecommand, or has the same parameters in the same layout.
         """
         found = {}
-        for row in self.telemetry.values():
+        for row in self.readable.values():
             for name in {
                 item.telecommand: None for item in row.named.values() if item.telecommand is not None
             }:
@@ -147,7 +152,7 @@ class Unit:
             fields = {
                 item.of_parameter: item.name for item in command.named.values() if item.parameter is not None
             }
-            for row in self.telemetry.values() if command.action == "set_parameters" and fields else ():
+            for row in self.readable.values() if command.action == "set_parameters" and fields else ():
                 places = {
                     fields[item.of_parameter]: item.name
                     for item in row.named.values()
@@ -214,7 +219,7 @@ def _parameter(item: Any) -> Parameter:
 def _row(row: Any, icd: InterfaceDefinition) -> Row:
     return Row(
         row.kind, row.id, row.name, tuple(_fields(row, icd)), row.klass, row.provenance, row.source, row.action, row.arguments,
-        row.answers, row.request, row.unsolicited,
+        row.answers, row.request, row.unsolicited, row.only_sent,
     )  # fmt: skip
 
 

@@ -18,6 +18,10 @@ from typing import Any, Literal
 from starhil.hil_tests.judge.rows import SIZES
 
 
+class InexpressibleError(OverflowError):
+    """A message that no header of the unit can express."""
+
+
 @dataclass(frozen=True)
 class Opened:
     """A header that was read: values by role, name of the class, and size."""
@@ -62,6 +66,15 @@ class Header:
         bits = [bit.width for model in self._models for bit in model.bits if bit.role == role]
         return max(fields + bits, default=0)
 
+    def data_sizes(self, klass: str) -> range:
+        """Return the numbers of bytes of data that the length field of a class can state; any if there is none."""
+        model = next((item for item in self._in(klass) if item.role == "length"), None)
+        if model is None or "data" not in model.includes:
+            return range(1 << 16)
+        bits = 8 * _size(model) - model.type.startswith("i")
+        others = self._counted(model, self.size(klass), 0)
+        return range(max(0, -others), (1 << bits) - others)
+
     def place(self, model: Any, klass: str) -> tuple[int, int]:
         """Return offset and size of a field in messages of a class."""
         before = [_size(item) for item in self._in(klass)]
@@ -75,7 +88,7 @@ class Header:
     def write(self, values: Mapping[str, int], klass: str, data_size: int) -> bytes:
         """Return the header of a message; a role without a value has its default.
 
-        Raises OverflowError for a value that does not fit its field.
+        Raises InexpressibleError for a value that does not fit its field.
         """
         line = b""
         for model in self._in(klass):
@@ -85,16 +98,19 @@ class Header:
                 for bit in model.bits:
                     value = _sent(bit, values)
                     if value >> bit.width:
-                        raise OverflowError(f"{bit.role} {value} does not fit {bit.width} bits")
+                        raise InexpressibleError(f"{bit.role} {value} does not fit {bit.width} bits")
                     number |= value << shift
                     shift += bit.width
             elif model.role == "length":
                 number = self._counted(model, self.size(klass), data_size)
             else:
                 number = _sent(model, values)
-            line += number.to_bytes(
-                _size(model), model.order or self._order, signed=model.type.startswith("i")
-            )
+            try:
+                line += number.to_bytes(
+                    _size(model), model.order or self._order, signed=model.type.startswith("i")
+                )
+            except OverflowError:
+                raise InexpressibleError(f"{model.role} {number} does not fit {model.type}") from None
         return line
 
     def read(self, body: bytes, klass: str = "") -> Opened | None:

@@ -277,11 +277,13 @@ class Row:
     action, arguments
         Action that a telecommand performs, and its fixed arguments.
     answers
-        Answers in order: `echo`, `reply`.
+        Answers in order: `echo`, `reply`, `row:NAME`.
     request
         Text that requests the row on a serial line; empty if a header does.
     unsolicited
         Rate in Hz at which it is sent without a request, or events after which it is sent; None if it is not.
+    only_sent
+        Whether no request reads it.
     """
 
     kind: RowKind
@@ -296,6 +298,7 @@ class Row:
     answers: tuple[str, ...] = ("reply",)
     request: str = ""
     unsolicited: float | Sequence[str] | None = None
+    only_sent: bool = False
 
     def __repr__(self) -> str:
         return f"Row({self.kind} {self.id} {self.name})"
@@ -314,6 +317,11 @@ class Row:
     def is_telemetry(self) -> bool:
         """Whether the row is telemetry."""
         return self.kind == "telemetry"
+
+    @property
+    def is_streamed(self) -> bool:
+        """Whether the unit sends the row regularly: at a rate, or with each measurement."""
+        return isinstance(self.unsolicited, float) or "frame" in (self.unsolicited or ())
 
     def example(self) -> dict[str, Value]:
         """Return values that must be accepted."""

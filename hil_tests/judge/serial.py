@@ -86,6 +86,12 @@ class SerialLine:
             self._requests_in = list(_formats(unit, "request"))
             self._answers_in = list(_formats(unit, "reply"))
         self.envelope = self._answers_in[-1].envelope
+        self.streamed = {
+            (row.klass, row.id) for row in unit.telemetry.values() if row.unsolicited is not None
+        }
+        """Class and ID of the rows that may come without a request, though nothing in their messages says so."""
+        self._left = 0
+        """Number of answers to the oldest request that have not come."""
         self.clear()
 
     def request_format(self, klass: str) -> tuple[Framing, Envelope]:
@@ -96,7 +102,7 @@ class SerialLine:
         """Forget everything received and asked."""
         self.received = bytearray()
         self._asked: deque[Request] = deque()
-        self._echoed = False
+        self._begin()
 
     def numbered(self, request: Request) -> Request:
         """Return a request with the next sequence number; successive ones differ in every bit."""
@@ -127,6 +133,8 @@ class SerialLine:
     def expect(self, request: Request) -> None:
         """Note a request, in order."""
         self._asked.append(request)
+        if len(self._asked) == 1:
+            self._begin()
 
     def feed(self, data: bytes) -> list[Answer]:
         """Return the answers that these bytes complete."""
@@ -169,17 +177,41 @@ class SerialLine:
         if taken.junk or (echo is not None and taken.body != echo):
             answer = Answer("malformed", data=taken.body)
         elif asked is not None and echo is not None:
-            if self._answers(asked, "reply"):
+            if self._left:
                 self._echoed = True
                 return None
             answer = Answer("ack", row_id=asked.id, klass=asked.klass)
         else:
             answer = envelope.answer(taken, asked)
-        ends = answer.final and answer.kind not in ("unsolicited", "burst")
-        if ends and asked is not None and (answer.row_id in (None, asked.id) or answer.kind == "malformed"):
-            self._asked.popleft()
-            self._echoed = False
+        awaited = asked is not None and (
+            answer.row_id in (None, asked.id) or self._follows(asked, answer) or answer.kind == "malformed"
+        )
+        streamed = (answer.klass, answer.row_id) in self.streamed
+        if (
+            streamed
+            and not awaited
+            and answer.kind == "telemetry"
+            and not envelope.marks_unsolicited(answer.klass)
+        ):
+            return replace(answer, kind="unsolicited")
+        if awaited and answer.final and answer.kind not in ("unsolicited", "burst"):
+            self._left -= 1
+            if self._left <= 0 or answer.kind in ("nack", "malformed") or self.envelope.has_final:
+                self._asked.popleft()
+                self._begin()
         return answer
+
+    def _begin(self) -> None:
+        """Begin to await the answers of the oldest request."""
+        self._echoed = False
+        row = self._unit.row(self._asked[0]) if self._asked else None
+        answers = () if row is None else self._unit.serial_answers(row)
+        self._left = sum(answer != "echo" for answer in answers)
+
+    def _follows(self, asked: Request, answer: Answer) -> bool:
+        """Return whether an answer is another row that answers a request."""
+        row, other = self._unit.row(asked), self._unit.row(Request(answer.row_id or 0, klass=answer.klass))
+        return row is not None and other is not None and f"row:{other.name}" in row.answers
 
     def _answers(self, request: Request, kind: str) -> bool:
         row = self._unit.row(request)
@@ -198,8 +230,9 @@ def _formats(unit: Unit, direction: str) -> Iterator[Format]:
     """Yield the formats of a direction in the order in which they apply; the last is that of all other messages."""
     link = unit.serial
     elsewhere: tuple[str, ...] = ()
+    silent = {item.name for item in unit.classes if not _has_messages(unit, item.name, direction)}
     for model in link.format:
-        if model.direction not in (None, direction):
+        if model.direction not in (None, direction) or (model.classes and silent.issuperset(model.classes)):
             continue
         classes = tuple(model.classes or ())
         framing = _framing(unit, model.framing or link.framing)
@@ -207,8 +240,21 @@ def _formats(unit: Unit, direction: str) -> Iterator[Format]:
         if not classes:
             return
         elsewhere += classes
+    if elsewhere and {item.name for item in unit.classes} <= silent.union(elsewhere):
+        return
     framing = _framing(unit, link.framing)
     yield Format((), framing, Headed(unit, framing, link.check, (), elsewhere))
+
+
+def _has_messages(unit: Unit, klass: str, direction: str) -> bool:
+    """Return whether there are requests, or answers, of a class; a class without rows has both."""
+    rows = [row for row in unit.rows if row.klass == klass]
+    if direction == "request":
+        return not rows or any(not row.only_sent for row in rows)
+    models = [item for item in unit.serial.reply_header if item.classes is None or klass in item.classes]
+    roles = {part.role for item in models for part in (item, *item.bits)}
+    refused = not roles.isdisjoint(("status", "ack")) or unit.serial.refusal is not None
+    return refused or not rows or any(row.answers or row.is_telemetry for row in rows)
 
 
 def _framing(unit: Unit, model: Any) -> Framing:
@@ -254,12 +300,17 @@ class Headed:
         coded = [item for item in unit.classes if item.code is not None]
         requests = [(item.name, item.code) for item in coded]
         replies = [(item.name, item.code if item.reply is None else item.reply) for item in coded]
+        self._marked = {
+            item.name for item in coded if item.unsolicited not in (None, dict(replies)[item.name])
+        }
         self._unsolicited = {item.unsolicited for item in coded if item.unsolicited is not None}
         replies += [(item.name, item.unsolicited) for item in coded if item.unsolicited is not None]
         self.requests = Header(link.request_header, order, requests, sizes)
         self.replies = Header(link.reply_header, order, replies, sizes)
         self._codes = dict(requests)
         self.has_codes = "status" in self.replies.roles() or CODE in (link.refusal or "")
+        self.has_final = "final" in self.replies.roles()
+        self.names_rows = "id" in self.replies.roles()
         self.sequence_bits = self.requests.width("sequence")
         self.numbers = 1 << self.replies.width("sequence")
         self._numbered = self.replies.counted()
@@ -276,6 +327,10 @@ class Headed:
             raise ValueError(f"no text requests {request} with {len(request.data)} bytes")
         values = {"id": request.id, "class": self._codes.get(request.klass, 0), "sequence": request.sequence}
         return self.closed(self.requests.write(values, request.klass, len(request.data)), request.data)
+
+    def data_sizes(self, klass: str) -> range:
+        """Return the numbers of bytes of data that requests of a class can have."""
+        return self.requests.data_sizes(klass)
 
     def closed(self, header: bytes, data: bytes) -> bytes:
         """Return header, data and check."""
@@ -332,7 +387,8 @@ class Headed:
         values = opened.values
         asynchronous = values.get("class") in self._unsolicited
         numbered = ("unsolicited" if asynchronous else "reply") in self._numbered
-        if asked is not None and not asynchronous and not numbered:
+        named = asked is not None and opened.values.get("id", asked.id) == asked.id
+        if asked is not None and named and not asynchronous and not numbered:
             sequence = values.get("sequence", asked.sequence)
             if sequence != asked.sequence:
                 return malformed(fault=f"sequence {sequence}, must be {asked.sequence}")
@@ -369,6 +425,10 @@ class Headed:
             "malformed" if asked is None else "nack", int(number or 0), text, row_id, klass, body=body
         )
 
+    def marks_unsolicited(self, klass: str) -> bool:
+        """Return whether unsolicited telemetry of a class has another code than an answer."""
+        return klass in self._marked
+
     def can_refuse(self, klass: str) -> bool:
         """Return whether there is a text for refusals, or the header of a class has a status or an acknowledge bit."""
         refusal = self._unit.serial.refusal
@@ -383,22 +443,32 @@ class Dialect:
     """The CubeSpace dialects of the answers; requests are the same in all: ID and data."""
 
     has_codes = True
+    has_final = False
     sequence_bits = 0
     numbers = 0
 
     def __init__(self, unit: Unit, dialect: str) -> None:
         self._unit, self._dialect = unit, dialect
         self.has_unsolicited = dialect == "c"
+        self.names_rows = dialect != "b"
 
     def body(self, request: Request) -> bytes:
         """Return ID and data."""
         return bytes((request.id,)) + request.data
+
+    def data_sizes(self, klass: str) -> range:  # noqa: ARG002 -- of all
+        """Return any number: the end of a message is marked."""
+        return range(1 << 16)
 
     def size(self, begun: bytes, asked: Request | None) -> int | None:  # noqa: ARG002 -- the framing marks the end
         """Return None: the end of a message is marked."""
         return None
 
     def can_refuse(self, klass: str) -> bool:  # noqa: ARG002 -- in all
+        """Return True."""
+        return True
+
+    def marks_unsolicited(self, klass: str) -> bool:  # noqa: ARG002 -- in all that have it
         """Return True."""
         return True
 
@@ -452,5 +522,6 @@ Envelope = Headed | Dialect
 """What surrounds the data of a message within its framing.
 
 `sequence_bits` is the width of the number of a request, 0 without one; `numbers` is how many numbers an answer may have;
-`has_codes` is whether a refusal carries a code.
+`has_codes` is whether a refusal carries a code, `has_final` whether a message says that it is the last of an answer,
+`names_rows` whether an answer has the ID of its row.
 """

@@ -40,6 +40,8 @@ def commands(icd: InterfaceDefinition, target: str) -> Iterator[str]:
     bits = key_bits(icd)
     scope = Scope("COSMOS")
     for row in icd.rows:
+        if row.only_sent:
+            continue
         name = scope.claim(command_name(row), f"{row.kind} {row.name}")
         doc = row.doc if row.kind == "telecommand" else f"Request {row.name}."
         key = key_of(icd, row)

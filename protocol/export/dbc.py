@@ -85,6 +85,10 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
     request = REQUEST_TYPES[row.kind][long]
     reply = REPLY_TYPES[ReplyKind.TELEMETRY if telemetry else ReplyKind.ACK][long and telemetry]
     asked, answered = _id(request, *to_device), _id(reply, *to_host)
+    if row.only_sent:
+        sent = MessageType.UNSOLICITED_FIRST if long else MessageType.UNSOLICITED_LAST
+        yield _Message(_id(sent, *to_host), f"TLM_{row.name}", row.size, "SENSOR", fields, row.doc)
+        return
     if telemetry:
         yield _Message(asked, f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}")
         yield _Message(answered, f"TLM_{row.name}", row.size, "SENSOR", fields, row.doc)

@@ -40,6 +40,8 @@ def example_text(exchange: Exchange) -> str:
     request, answers = (
         ", ".join(f"`{frame}`" for frame in frames) for frames in (exchange.request, exchange.answers)
     )
+    if exchange.row.only_sent:
+        return f"Example on {exchange.link}, without a request: {answers}."
     return f"Example on {exchange.link}: request {request}; answer {answers or 'none'}."
 
 
@@ -69,7 +71,8 @@ def anchor(row: Row) -> str:
 def facts(row: Row) -> str:
     """Return size and source of a row."""
     size = f"{row.size} byte{'' if row.size == 1 else 's'}" if row.size else "No data"
-    return f"{size}, {row.provenance}{f': {row.source}' if row.source else ''}"
+    sent = ", only sent" if row.only_sent else ""
+    return f"{size}{sent}, {row.provenance}{f': {row.source}' if row.source else ''}"
 
 
 def beyond(row: Row, field: Field) -> str:

@@ -78,7 +78,9 @@ def messages(unit: Path) -> list[object]:
 
 def test_the_unit_of_the_tutorial_passes_every_case(tmp_path: Path) -> None:
     found = list(outcomes(unit_of("tutorial", tmp_path / "lynx")))
-    assert [(o.id, o.expected, o.seen) for o in found if o.status != "passed"] == []
+    assert [
+        (o.id, o.expected, o.seen) for o in found if o.status != "passed" and ".unjudged." not in o.id
+    ] == []
     assert len(found) >= 45
 
 
@@ -102,7 +104,11 @@ def test_a_unit_on_any_link_passes_every_case(link: str, order: str, tmp_path: P
     folder = write_unit(tmp_path / "unit", link, order)
     with SimulatedUnit("serial", unit=folder) as simulated:
         outcomes = [run_case(simulated.probe, case) for case in serial_suite(read_unit(folder))]
-    assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status != "passed"] == []
+    assert [
+        (o.id, o.expected, o.seen, o.log[-4:])
+        for o in outcomes
+        if o.status != "passed" and ".unjudged." not in o.id
+    ] == []
     assert len(outcomes) >= 45
 
 

@@ -8,10 +8,13 @@ import pytest
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, run_conformance
-from starhil.hil_tests.errors import BenchError, NackError
+from starhil.hil_tests.errors import BenchError, NackError, ScriptError
+from starhil.hil_tests.script import load_script
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Reply, ReplyKind
+from starhil.protocol.serial_stack import SerialStack
+from tests.user_units import STREAM, packets, written
 
 DEFINITION = """
 [unit]
@@ -112,3 +115,35 @@ def test_a_telecommand_without_an_answer_is_not_waited_for(ask):
 def test_a_refusal_has_the_name_that_the_unit_gives_its_number(ask):
     with pytest.raises(NackError, match=r"error 66 \(busy\)"):
         ask(lambda obc: obc.command("go"), Reply(ReplyKind.NACK, 1, code=66, klass="do"))
+
+
+def test_a_streamed_row_that_looks_like_an_answer_is_unsolicited(tmp_path):
+    stream = load_unit(written(tmp_path / "unit", STREAM))
+    status, attitude = stream.telemetry["status"], stream.telemetry["attitude"]
+    link = FakeLink(
+        Reply(ReplyKind.TELEMETRY, attitude.id, attitude.encode({"w": 0.5})),
+        Reply(ReplyKind.TELEMETRY, status.id, bytes(status.size)),
+    )
+    link.marks_unsolicited = SerialStack(stream).marks_unsolicited
+
+    async def scenario():
+        client = AsyncObcClient(link, stream)
+        read = await client.read("status")
+        return read, await client.wait_unsolicited("attitude", timeout_s=1.0), client.stray_replies
+
+    read, streamed, stray = asyncio.run(scenario())
+    assert (read.name, streamed["w"], list(stray)) == ("status", 0.5, [])
+
+
+def test_a_row_that_is_only_sent_cannot_be_read(tmp_path):
+    unit = load_unit(written(tmp_path / "unit", packets()))
+    link = FakeLink()
+    with pytest.raises(BenchError, match="attitude: is only sent, and no request reads it"):
+        asyncio.run(AsyncObcClient(link, unit).read("attitude"))
+    assert link.requests == []
+    script = tmp_path / "session.toml"
+    script.write_text('[[step]]\nread = "attitude"\n', encoding="utf-8")
+    with pytest.raises(ScriptError, match="'attitude' is only sent, and no request reads it: use listen"):
+        load_script(script, unit)
+    script.write_text('[[step]]\nlisten = "attitude"\n', encoding="utf-8")
+    assert len(load_script(script, unit).steps) == 1

@@ -41,6 +41,7 @@ def shape(
         "kind": kind,
         "request": "",
         "answers": answers,
+        "only_sent": False,
     }
     sizes = {"request_size": request_size, "reply_size": reply_size, "size": max(request_size, reply_size)}
     return cast("Row", SimpleNamespace(**keys, **sizes))

@@ -164,7 +164,7 @@ def test_refusal_that_the_header_cannot_express_sends_nothing() -> None:
 
 
 def test_code_that_does_not_fit_the_header_is_an_error() -> None:
-    with pytest.raises(ProtocolError, match="status 300 does not fit 1 bytes"):
+    with pytest.raises(ProtocolError, match=r"link\.serial\.reply_header: status 300 does not fit 8 bits"):
         SAGITTA.encode_reply(Reply(ReplyKind.NACK, 6, code=300, klass="set"))
 
 

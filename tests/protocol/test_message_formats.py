@@ -177,7 +177,7 @@ STUFFING = 'framing = {{ kind = "fixed", start = [241], stuffing = {{ escape = {
         (LINK.format("") + FORMAT.format('direction = "reply"'), "link.serial.format 1: needs `framing` or `check`"),
         (LINK.format("") + CLASSES + FORMAT.format('classes = ["c"]\ncheck = { kind = "none" }'), "link.serial.format 1: no class named 'c' (known: a, b)"),
         (LINK.format("") + FORMAT.format('framing = { kind = "cubespace" }'), "framing cubespace has its own formats"),
-        (LINK.format("") + CLASSES + FORMAT.format('classes = ["b"]\ncheck = { kind = "xor" }'), "several framings have no start; their first bytes must differ"),
+        (LINK.format("") + CLASSES + FORMAT.format('classes = ["b"]\ncheck = { kind = "xor" }'), "framings delimited of class b and delimited of all other messages have no `start`; give them different first bytes"),
         (LINK.format("") + CLASSES + FORMAT.format('classes = ["b"]\nframing = { kind = "slip" }'), "framing slip cannot stand beside another; set `direction`"),
         (LINK.format("") + FORMAT.format('check = { kind = "xor" }') * 2, "a format after one without `classes` fits no message"),
         (LINK.format("") + FORMAT.format('direction = "reply"\n' + STUFFING.format(0xF0, 0)), "mask 0x00 must have bits"),

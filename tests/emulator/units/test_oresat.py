@@ -9,8 +9,12 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import NackError
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
+from starhil.protocol.canopen.eds import build_eds
+from starhil.protocol.icd import load_unit
 from starhil.protocol.names import UNITS_FOLDER
 from tests.emulator.units.clients import Emulated, arcseconds_between, true_matrix, with_unit
+from tests.protocol.canopen.conftest import import_eds
 
 NODE = 0x2C
 STANDBY, STAR_TRACK = 2, 4
@@ -242,7 +246,7 @@ def test_the_rest_of_the_card_reads_its_defaults_keeps_settings_and_has_no_files
         assert upload(unit, 0x3004, 2) == b"[]"  # files to read
         assert [upload(unit, 0x4001, n) for n in (1, 2, 3, 7, 8)] == [
             b"\x01",
-            (1000).to_bytes(4, "little"),
+            (100).to_bytes(4, "little"),
             (1).to_bytes(4, "little"),
             bytes(4),
             b"\x01",
@@ -252,5 +256,20 @@ def test_the_rest_of_the_card_reads_its_defaults_keeps_settings_and_has_no_files
         no_data = (0x0800_0024).to_bytes(4, "little")
         assert exchange(unit, 0x40, 0x3004, 4)[4:] == exchange(unit, 0x40, 0x4001, 4)[4:] == no_data
         assert exchange(unit, 0x2F, 0x3005, 4, b"x")[4:] == no_data
+
+    with_unit("oresat", "canopen", scenario)
+
+
+def test_the_capture_filter_has_the_sub_indices_limits_and_defaults_of_the_source():
+    """base/star_tracker.yaml, 4003h: enable, lower bound and percentage, upper bound and percentage, both up to 100."""
+    dictionary = import_eds(build_eds(DeviceDictionary(load_unit("oresat"))), NODE)
+    entries = [dictionary[0x4003][number] for number in range(1, 6)]
+    assert [item.name for item in entries] == [
+        "enable", "lower_bound", "lower_percentage", "upper_bound", "upper_percentage",
+    ]  # fmt: skip
+    assert [item.max for item in entries] == [1, 255, 100, 255, 100]
+
+    def scenario(unit: Emulated) -> None:
+        assert b"".join(upload(unit, 0x4003, number) for number in range(1, 6)) == bytes((1, 0, 0, 0, 0))
 
     with_unit("oresat", "canopen", scenario)
