@@ -75,7 +75,10 @@ def _compile(folder: Path) -> None:
 
 
 def _header(found: list[Variable], token: str) -> str:
-    """Return model.h: the numbers of the variables that the shell uses, and all start values."""
+    """Return model.h: all variables with their start values, and the numbers of those that the shell uses."""
+    rows = [
+        f"{{{c_string(each.name)}, {each.kind('3').upper()}, {each.causality.upper()}}}" for each in found
+    ]
     texts = [each for each in found if isinstance(each.start, str)]
     numbers = found[: -len(texts)]
     return "\n".join((
@@ -83,6 +86,7 @@ def _header(found: list[Variable], token: str) -> str:
         f"#define TOKEN {c_string(token)}",
         f"enum {{ NUMBERS = {len(numbers)}, TEXTS = {len(texts)}, TEXT_SIZE = {TEXT_SIZE} }};",
         f"enum {{ TIME = 0, COMMAND = {[each.name for each in texts].index('command')} }};",
+        f"#define VARIABLES_OF_MODEL {{ {', '.join(rows)} }}",
         f"#define START_NUMBERS {{ {', '.join(repr(float(each.start)) for each in numbers)} }}",
         f"#define START_TEXTS {{ {', '.join(c_string(str(each.start)) for each in texts)} }}",
         "",
