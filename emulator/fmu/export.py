@@ -16,6 +16,7 @@ from jinja2 import StrictUndefined, Template
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.fmu.variables import TEXT_SIZE, Fmi, Variable, variables
 from starhil.protocol.quoting import c_string
+from starid.files import write_atomically
 
 FOLDER: Final = Path(__file__).parent
 MODEL: Final = "startracker"
@@ -54,12 +55,19 @@ def export_fmu(path: Path, profile: str, command: str, fmi: Fmi) -> None:
     }
     if fmi == "3":
         files["sources/buildDescription.xml"] = _text("buildDescription.xml")
-    with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, text in files.items():
-            archive.writestr(name, text)
-        archive.extractall(folder)
-        _compile(Path(folder, "sources"))
-        archive.write(Path(folder, "sources", f"{MODEL}.so"), f"{BINARIES[fmi]}/{MODEL}.so")
+
+    def write(part: Path) -> None:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive,
+        ):
+            for name, text in files.items():
+                archive.writestr(name, text)
+            archive.extractall(folder)
+            _compile(Path(folder, "sources"))
+            archive.write(Path(folder, "sources", f"{MODEL}.so"), f"{BINARIES[fmi]}/{MODEL}.so")
+
+    write_atomically(path, write)
 
 
 def _compile(folder: Path) -> None:
