@@ -14,13 +14,14 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.pipeline.imager import WorkerImager
 from starhil.emulator.pipeline.messages import PipelineReady
-from starhil.emulator.profile import Profile
+from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.profile_sections import RunConfig
 from starhil.emulator.run import Run
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
 from starhil.hil_tests.private_can_bus import hub_thread
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.names import bundled
 from tests.emulator.runs import CAMERA, Control, FakeImager, FirstHead, command, read
@@ -244,9 +245,21 @@ def test_a_bad_scenario_is_named_with_file_and_key(tmp_path, text, said):
     assert "\n" not in str(refusal.value)
 
 
-def test_an_unknown_scenario_is_answered_with_the_known_ones():
-    with pytest.raises(EmulatorError, match="bad_day"):
-        load_scenario("bad_dya")
+@pytest.mark.parametrize("name", ["bad_dya", ""])
+def test_an_unknown_scenario_is_answered_with_the_known_ones(name):
+    with pytest.raises(EmulatorError, match=f"scenario '{name}': not found; give a path, or one of: bad_day"):
+        load_scenario(name)
+
+
+def test_an_empty_name_of_a_profile_or_unit_is_not_the_working_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "unit.toml").write_text("[unit]\n")
+    with pytest.raises(EmulatorError, match="profile '': not found"):
+        load_profile("")
+    with pytest.raises(IcdError, match="unit '': not found"):
+        load_unit("")
+    with pytest.raises(EmulatorError, match="unit: unit '': not found"):
+        load_profile("ideal", ["unit="])
 
 
 @pytest.mark.parametrize(
