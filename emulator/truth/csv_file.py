@@ -79,7 +79,9 @@ def read_csv(path: Path, text: str) -> FileTruth:
         where = f"truth file {path} line {number}"
         row = _parse_row(where, columns, line)
         if times and row["t"] - times[-1] < SHORTEST_S:
-            raise EmulatorError(f"{where}: t is not later than in the previous row, by at least {SHORTEST_S:g} s")
+            raise EmulatorError(
+                f"{where}: t is not later than in the previous row, by at least {SHORTEST_S:g} s"
+            )
         times.append(row["t"])
         attitudes.append(_attitude(where, needed, row))
         if has_orbit:

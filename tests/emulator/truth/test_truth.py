@@ -149,7 +149,7 @@ def test_file_takes_angles_rates_and_repeats(tmp_path):
         ("t,qx,qy,qz,qw\n0,0,0,0,1\n1,0,0,x,1\n", "line 3: qz is not a number"),
         ("t,qx,qy,qz,qw\n0,0,0,0,1\n# c\n1,0,0,1\n", "line 4: 4 values for 5 columns"),
         ("t,qx,qy,qz,qw\n0,0,0,0,1\n0,0,0,0,1\n", "line 3: t is not later"),
-        ("t,qx,qy,qz,qw\n0,0,0,0,1\n1e-320,0,0,1,1\n", "line 3: t is not later"),
+        ("t,qx,qy,qz,qw\n0,0,0,0,1\n1e-320,0,0,1,0\n", "line 3: t is not later"),
         ("t,qx,qy,qz,qw\n0,0,0,0,2\n", "line 2: the quaternion is not of length 1"),
         ("t,qx,qy,qz,qw\n0,0,0,0,nan\n", "line 2: qw is not a number"),
         ("t,ra_deg,dec_deg,roll_deg\n0,0,91,0\n", "line 2: dec_deg is outside"),
