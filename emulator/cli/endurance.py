@@ -220,20 +220,21 @@ def write_life(life: Any, violation: str, folder: Path) -> list[Path]:
     from starhil.hil_tests.endurance.life import UNRECORDED
     from starhil.hil_tests.endurance.violating_life import session_of
     from starhil.hil_tests.judge.definition import read_unit
-    from starid.files import write_atomically
 
     name = f"{Path(life.unit).name}-{life.seed}"
     file, session, recording = folder / f"{name}.json", folder / f"{name}.toml", folder / f"{name}-recording"
-    texts = {
-        file: json.dumps({**asdict(life), "violation": violation}, indent=1) + "\n",
-        session: session_of(life, read_unit(life.unit), violation),
-    }
-    for path, text in texts.items():
-        write_atomically(path, lambda part, text=text: part.write_text(text, encoding="utf-8"))
+    _write(file, json.dumps({**asdict(life), "violation": violation}, indent=1) + "\n")
+    _write(session, session_of(life, read_unit(life.unit), violation))
     if UNRECORDED & {step["do"] for step in life.steps}:
         return [file, session]
     run_once(life, record=recording)
     return [file, session, recording]
+
+
+def _write(path: Path, text: str) -> None:
+    from starid.files import write_atomically
+
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def read_life(path: Path) -> Any:
