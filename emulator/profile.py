@@ -264,7 +264,7 @@ def _checks(
 def _path_of_unit(name: str, folder: Path) -> Path | None:
     path = folder / find("unit", name)
     try:
-        return path if path.exists() else None
+        return path if name and path.exists() else None
     except OSError:  # too long a name, for example
         return None
 

@@ -237,6 +237,8 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
         shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
         values["truth"]["path"] = TRUTH_SOURCE_FILE
     state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
+    if state is not None:
+        values["run"]["state_dir"] = STATE_FOLDER
     if state is not None and state.is_dir():
         shutil.copytree(state, folder / STATE_FOLDER)
     if scenario:

@@ -16,7 +16,7 @@ def find_toml(kind: Kind, name_or_path: str, relative_to: Path = Path()) -> Path
     failed = f"{kind} {name_or_path!r}: cannot be read"  # RuntimeError: the home folder of an unknown user
     with explained(failed, "give another path", errors=(OSError, RuntimeError)):
         path = relative_to / find(kind, name_or_path)
-        found = path.exists()
+        found = bool(name_or_path) and path.exists()  # an empty name is the working folder as a path
     if not found:
         raise EmulatorError(not_found(kind, name_or_path))
     return path

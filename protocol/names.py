@@ -59,7 +59,7 @@ def find_unit(name_or_folder: str | Path) -> Path:
     Raises IcdError, whose text suggests similar names.
     """
     path = find("unit", name_or_folder)
-    if path.exists():
+    if name_or_folder != "" and path.exists():  # an empty name is the working folder as a path
         return path
     raise IcdError(f"{not_found('unit', name_or_folder)}; `starhil unit new FOLDER` creates one")
 

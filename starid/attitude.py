@@ -38,6 +38,9 @@ _ROTATION_TOLERANCE: Final = 1e-6
 _SMALL_ANGLE: Final = 1e-8
 """Below this angle (radians) sin(a/2)/a is 1/2 to the last bit."""
 
+_SMALL_TURN: Final = 1e-4
+"""Turn (radians) below which the coefficient of the second order in Bortz's equation is 1/12 to the last bit."""
+
 
 @dataclass(frozen=True)
 class AttitudeError:
@@ -272,6 +275,33 @@ def rate_between(first: Attitude, second: Attitude, dt: float) -> Array:
 def interpolate(first: Attitude, second: Attitude, fraction: float) -> Attitude:
     """Interpolate along the shortest rotation between two attitudes (fraction 0 = first, 1 = second)."""
     return first.rotated(second.error_to(first).rotation_vector_rad * fraction)
+
+
+def interpolate_with_rates(
+    first: Attitude, second: Attitude, first_rate: Array, second_rate: Array, fraction: float, dt: float
+) -> Attitude:
+    """Interpolate on the cubic of the rotation vector that also has both rates.
+
+    Parameters
+    ----------
+    first_rate, second_rate : array (3,)
+        Rates in rad/s, sensor frame, at the two attitudes, which are `dt` seconds apart.
+    """
+    turn = second.error_to(first).rotation_vector_rad
+    f, g = fraction, 1.0 - fraction
+    start, end = dt * first_rate, dt * _vector_rate(turn, second_rate)
+    return first.rotated(f * f * (3.0 - 2.0 * f) * turn + f * g * (g * start - f * end))
+
+
+def _vector_rate(turn: Array, rate: Array) -> Array:
+    """Return the derivative of a rotation vector at a body rate (Bortz 1971, eq. 9)."""
+    angle = float(np.linalg.norm(turn))
+    second = 1.0 / 12.0
+    if angle > _SMALL_TURN:
+        second = (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / angle**2
+    once = np.cross(turn, rate)
+    derivative: Array = rate + 0.5 * once + second * np.cross(turn, once)
+    return derivative
 
 
 def _turn(angle: float) -> float:

@@ -6,6 +6,7 @@ pipe or standard output is written into it, not moved over it.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import math
 import os
@@ -14,7 +15,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -160,13 +161,27 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     target = Path(os.path.realpath(path))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-    os.close(descriptor)
-    part = Path(name)
+    with removing_new_folders_on_error(target.parent):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
+        os.close(descriptor)
+        part = Path(name)
+        try:
+            write(part)
+            part.chmod(0o644)
+            part.replace(target)
+        finally:
+            part.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def removing_new_folders_on_error(folder: Path) -> Iterator[None]:
+    """Remove a folder and its parents that are made inside, unless they have contents, if the body raises."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
-        write(part)
-        part.chmod(0o644)
-        part.replace(target)
-    finally:
-        part.unlink(missing_ok=True)
+        yield
+    except BaseException:
+        with contextlib.suppress(OSError):  # not empty
+            for path in filter(Path.is_dir, missing):
+                path.rmdir()
+        raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
 
@@ -9,6 +10,9 @@ def main() -> None:
     """Run the command line; Ctrl-C during imports ends it without a traceback."""
     try:
         if sys.argv[1:2] == ["run"] and "--help" not in sys.argv:
+            for number in (signal.SIGTERM, signal.SIGHUP):
+                if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+                    signal.signal(number, _end)
             from starhil.emulator.pipeline.worker_process import start_ahead
 
             start_ahead()  # the worker takes longest to start, so it is started before the imports of this process
@@ -16,3 +20,8 @@ def main() -> None:
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     run()
+
+
+def _end(_number: int, _frame: object) -> None:
+    """End a run that starts with the status of one that is ended later, when the event loop has the signals."""
+    raise SystemExit(0)

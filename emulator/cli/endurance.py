@@ -7,6 +7,7 @@ import itertools
 import json
 import logging
 import resource
+import shlex
 import tempfile
 import time
 from collections.abc import Iterator
@@ -91,7 +92,7 @@ def command(
     """
     if life is not None:
         found = read_life(life)
-        outcomes = [{**live(found.unit, found, rendered=False, folder=output), "kind": "usual"}]
+        outcomes = [{**live(found, output), "repeat": f"--life {shlex.quote(str(life))}"}]
     else:
         outcomes = list(_run(plan, output))
     figures = {"seed": plan.seed, **summary(outcomes)}
@@ -138,20 +139,31 @@ def live_from_seed(unit: str, seed: int, steps: int, kind: str, folder: Path) ->
     from starhil.protocol.icd import load_unit
 
     icd = load_unit(unit)
-    life = make_life(unit_of(icd), unit, links_of(icd), seed, steps, is_long=kind == "long")
-    return {**live(unit, life, rendered=kind == "rendered", folder=folder), "kind": kind}
+    life = make_life(
+        unit_of(icd),
+        unit,
+        links_of(icd),
+        seed,
+        steps,
+        is_long=kind == "long",
+        rendered=kind == "rendered",
+    )
+    repeat = f"--unit {shlex.quote(unit)} --seed {seed} --lives 1"
+    kinds = f"--rendered {int(kind == 'rendered')} --long {int(kind == 'long')}"
+    length = f" --steps {steps}" if kind == "usual" else ""
+    return {**live(life, folder), "repeat": f"{repeat} {kinds}{length}"}
 
 
-def live(unit: str, life: Any, *, rendered: bool, folder: Path) -> dict[str, Any]:
+def live(life: Any, folder: Path) -> dict[str, Any]:
     """Live a life; if it ends in a violation, shorten it and write it to the folder."""
     from starhil.hil_tests.endurance.violating_life import kind_of, shortened
 
     logging.getLogger("starhil").addHandler(logging.NullHandler())
     logging.getLogger("starhil").propagate = False
     begin = time.process_time()
-    outcome = run_once(life, rendered=rendered)
+    outcome = run_once(life)
     figures = {
-        "unit": unit, "seed": life.seed, "rendered": rendered, **asdict(outcome),
+        "unit": life.unit, "seed": life.seed, "rendered": life.rendered, **asdict(outcome),
         "cpu_s": time.process_time() - begin,
         "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
     }  # fmt: skip
@@ -159,14 +171,16 @@ def live(unit: str, life: Any, *, rendered: bool, folder: Path) -> dict[str, Any
         kind = kind_of(outcome.violation)
         upto = replace(life, steps=life.steps[: outcome.step + 1])
         short = (
-            upto if rendered else shortened(upto, lambda other: kind_of(run_once(other).violation) == kind)
+            upto
+            if life.rendered
+            else shortened(upto, lambda other: kind_of(run_once(other).violation) == kind)
         )
         figures["steps"] = len(short.steps)
         figures["files"] = [str(path) for path in write_life(short, outcome.violation, folder)]
     return figures
 
 
-def run_once(life: Any, *, rendered: bool = False, record: Path | None = None) -> Any:
+def run_once(life: Any, *, record: Path | None = None) -> Any:
     """Live a life once and return its outcome."""
     from starhil.emulator.endurance.simulated_loop import SimulatedLoop
     from starhil.emulator.endurance.unit_under_test import UnitUnderTest
@@ -185,11 +199,13 @@ def run_once(life: Any, *, rendered: bool = False, record: Path | None = None) -
             life.profile,
             life.seed,
             Path(folder),
-            rendered=rendered,
+            rendered=life.rendered,
             record=record,
         )
         try:
-            return loop.run_until_complete(LifeRun(life, unit_of(icd), unit, SIGMA_ARCSEC[rendered]).run())
+            return loop.run_until_complete(
+                LifeRun(life, unit_of(icd), unit, SIGMA_ARCSEC[life.rendered]).run()
+            )
         finally:
             unit.dispose()
             loop.close()
@@ -206,14 +222,19 @@ def write_life(life: Any, violation: str, folder: Path) -> list[Path]:
     from starhil.hil_tests.judge.definition import read_unit
 
     name = f"{Path(life.unit).name}-{life.seed}"
-    folder.mkdir(parents=True, exist_ok=True)
     file, session, recording = folder / f"{name}.json", folder / f"{name}.toml", folder / f"{name}-recording"
-    file.write_text(json.dumps({**asdict(life), "violation": violation}, indent=1) + "\n", encoding="utf-8")
-    session.write_text(session_of(life, read_unit(life.unit), violation), encoding="utf-8")
+    _write(file, json.dumps({**asdict(life), "violation": violation}, indent=1) + "\n")
+    _write(session, session_of(life, read_unit(life.unit), violation))
     if UNRECORDED & {step["do"] for step in life.steps}:
         return [file, session]
     run_once(life, record=recording)
     return [file, session, recording]
+
+
+def _write(path: Path, text: str) -> None:
+    from starid.files import write_atomically
+
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 
 
 def read_life(path: Path) -> Any:
@@ -225,7 +246,8 @@ def read_life(path: Path) -> Any:
     try:
         content = json.loads(read_user_text(path))
         links, steps = tuple(content["links"]), tuple(content["steps"])
-        return Life(content["unit"], content["seed"], links, content["profile"], steps)
+        rendered = content.get("rendered", False) is True
+        return Life(content["unit"], content["seed"], links, content["profile"], steps, rendered)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise EmulatorError(f"{path}: not a life of `starhil endurance`: {error}") from None
 
@@ -275,5 +297,4 @@ def _print(figures: dict[str, Any], outcomes: list[dict[str, Any]]) -> None:
         if item["violation"]:
             print(f"{item['unit']} seed {item['seed']}: {item['violation']}")
             print(f"  {item['steps']} steps; {' '.join(item['files'])}")
-            kind = f"--rendered {int(item['kind'] == 'rendered')} --long {int(item['kind'] == 'long')}"
-            print(f"  starhil endurance --unit {item['unit']} --seed {item['seed']} --lives 1 {kind}")
+            print(f"  starhil endurance {item['repeat']}")

@@ -38,6 +38,8 @@ class Simulation:
     def __init__(self, values: Values, stack: ExitStack) -> None:
         self._emulator: EmulatorProcess | None = None
         self._reported = 0
+        self._offset_s: float | None = None
+        """Time of the importer minus that of the emulator, seconds."""
         feed, control = values["feed"], values["control"]
         if not feed:
             try:
@@ -73,11 +75,14 @@ class Simulation:
             }
         if values["unix_s"]:
             message["unix_s"] = round(values["unix_s"], 9)
-        self._feed.exchange(f"inputs at {values['time']:g} s", message)
+        answer = self._feed.exchange(f"inputs at {values['time']:g} s", message)
+        if self._offset_s is None:
+            self._offset_s = message["t"] - answer["run_time_s"]
         for row in self._control.do("frames")["frames"]:
             found = {
                 each.name: row.get(each.key or each.name) for each in VARIABLES if each.causality == "output"
             }
+            found["exposure_s"] = row["run_time_s"] + self._offset_s
             values |= {name: value for name, value in found.items() if value is not None}
 
     def warnings(self) -> str:

@@ -32,9 +32,12 @@ async def report_slow_start() -> None:
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Write the file of an option -o, whose folder is made; a failure is one line."""
-    prepare_output(path, "-o")
-    with explained(f"{path}: cannot be written", "choose another file with -o"):
-        yield
+    from starid.files import removing_new_folders_on_error
+
+    with removing_new_folders_on_error(path.parent):
+        prepare_output(path, "-o")
+        with explained(f"{path}: cannot be written", "choose another file with -o"):
+            yield
 
 
 def print_text(text: str) -> None:

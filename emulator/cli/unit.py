@@ -74,7 +74,6 @@ def new(
     text = SKELETON.read_text(encoding="utf-8").replace("MY_UNIT", name.replace('"', "").replace("\\", ""))
     file = folder / "unit.toml"
     with explained(f"{file}: cannot be written", "choose another folder"):
-        folder.mkdir(parents=True, exist_ok=True)
         write_atomically(file, lambda temporary: temporary.write_text(text, encoding="utf-8"))
     print(f"wrote {file}; try: starhil unit check {folder}; starhil run --unit {folder} --serial auto")
 

@@ -16,6 +16,7 @@ from jinja2 import StrictUndefined, Template
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.fmu.variables import TEXT_SIZE, Fmi, Variable, variables
 from starhil.protocol.quoting import c_string
+from starid.files import write_atomically
 
 FOLDER: Final = Path(__file__).parent
 MODEL: Final = "startracker"
@@ -54,12 +55,19 @@ def export_fmu(path: Path, profile: str, command: str, fmi: Fmi) -> None:
     }
     if fmi == "3":
         files["sources/buildDescription.xml"] = _text("buildDescription.xml")
-    with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, text in files.items():
-            archive.writestr(name, text)
-        archive.extractall(folder)
-        _compile(Path(folder, "sources"))
-        archive.write(Path(folder, "sources", f"{MODEL}.so"), f"{BINARIES[fmi]}/{MODEL}.so")
+
+    def write(part: Path) -> None:
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as archive,
+        ):
+            for name, text in files.items():
+                archive.writestr(name, text)
+            archive.extractall(folder)
+            _compile(Path(folder, "sources"))
+            archive.write(Path(folder, "sources", f"{MODEL}.so"), f"{BINARIES[fmi]}/{MODEL}.so")
+
+    write_atomically(path, write)
 
 
 def _compile(folder: Path) -> None:
@@ -75,7 +83,10 @@ def _compile(folder: Path) -> None:
 
 
 def _header(found: list[Variable], token: str) -> str:
-    """Return model.h: the numbers of the variables that the shell uses, and all start values."""
+    """Return model.h: all variables with their start values, and the numbers of those that the shell uses."""
+    rows = [
+        f"{{{c_string(each.name)}, {each.kind('3').upper()}, {each.causality.upper()}}}" for each in found
+    ]
     texts = [each for each in found if isinstance(each.start, str)]
     numbers = found[: -len(texts)]
     return "\n".join((
@@ -83,6 +94,7 @@ def _header(found: list[Variable], token: str) -> str:
         f"#define TOKEN {c_string(token)}",
         f"enum {{ NUMBERS = {len(numbers)}, TEXTS = {len(texts)}, TEXT_SIZE = {TEXT_SIZE} }};",
         f"enum {{ TIME = 0, COMMAND = {[each.name for each in texts].index('command')} }};",
+        f"#define VARIABLES_OF_MODEL {{ {', '.join(rows)} }}",
         f"#define START_NUMBERS {{ {', '.join(repr(float(each.start)) for each in numbers)} }}",
         f"#define START_TEXTS {{ {', '.join(c_string(str(each.start)) for each in texts)} }}",
         "",

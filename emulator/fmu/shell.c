@@ -8,6 +8,7 @@
 #include "model.h"
 
 #include <errno.h>
+#include <math.h>
 #include <spawn.h>
 #include <stdarg.h>
 #include <stdbool.h>
@@ -24,6 +25,17 @@
 extern char **environ;
 
 enum status { OK = 0, WARNING = 1, ERROR = 3 };
+enum phase { PREPARING, RUNNING, ENDED };
+#define SHORTEST_STEP 1e-9 /* the resolution of the emulator's time, seconds */
+#define GAP 1e-3           /* between two steps, as a share of the second: more than rounding */
+
+enum kind { FLOAT64, INT32, BOOLEAN, STRING };
+enum causality { INDEPENDENT, INPUT, OUTPUT, PARAMETER };
+static const struct variable {
+    const char *name;
+    enum kind kind;
+    enum causality causality;
+} VARIABLES[] = VARIABLES_OF_MODEL;
 typedef void (*logger3)(void *environment, int status, const char *category, const char *message);
 typedef void (*logger2)(void *environment, const char *instance, int status, const char *category, const char *message, ...);
 struct callbacks2 {
@@ -43,6 +55,8 @@ struct values { /* the packet */
 
 struct unit {
     struct values values;
+    enum phase phase;
+    bool stepped;
     int link;
     pid_t process;
     char name[64];
@@ -78,6 +92,7 @@ static void end(struct unit *unit)
     }
     unit->link = -1;
     unit->process = 0;
+    unit->phase = ENDED;
 }
 
 static int exchange(struct unit *unit)
@@ -93,7 +108,7 @@ static int exchange(struct unit *unit)
     }
     if (size != (ssize_t)sizeof unit->values) {
         end(unit);
-        return report(unit, ERROR, "%s has ended", unit->values.texts[COMMAND]);
+        return report(unit, ERROR, "%s fmu serve has ended without an answer", unit->values.texts[COMMAND]);
     }
     if (unit->values.message[0] != '\0') {
         (void)report(unit, unit->values.status, "%s", unit->values.message);
@@ -111,6 +126,9 @@ static int begin(struct unit *unit)
     int ends[2], fault;
     posix_spawn_file_actions_t actions;
     posix_spawnattr_t attributes;
+    if (unit->phase != PREPARING) {
+        return report(unit, ERROR, "a simulation has begun already; reset the FMU to begin another");
+    }
     if (socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0, ends) != 0) {
         return report(unit, ERROR, "no socket: %s", strerror(errno));
     }
@@ -128,15 +146,37 @@ static int begin(struct unit *unit)
         unit->process = 0;
         return report(unit, ERROR, "%s does not start: %s", command, strerror(fault));
     }
+    unit->phase = RUNNING;
     return exchange(unit);
 }
 
+/* A step of the importer's: the inputs hold at its begin. */
 static int step(struct unit *unit, double time, double size)
 {
+    const double end_of_last = unit->values.numbers[TIME];
+    if (unit->phase != RUNNING) {
+        return report(unit, ERROR, unit->phase == ENDED ? "step at %g s: the simulation has ended; reset the FMU to begin another"
+                                                        : "step at %g s: the simulation begins when the initialization mode ends", time);
+    }
+    if (!isfinite(time) || !isfinite(size) || size < SHORTEST_STEP) {
+        return report(unit, ERROR, "step at %g s: its size is %g s; it must be at least %g s", time, size, SHORTEST_STEP);
+    }
+    if (unit->stepped && fabs(time - end_of_last) > GAP * size) {
+        return report(unit, ERROR, "step at %.9g s: it must begin where the last one has ended, at %.9g s", time, end_of_last);
+    }
     unit->values.numbers[TIME] = time;
     const int status = exchange(unit);
-    unit->values.numbers[TIME] += status == OK ? size : 0.0;
+    if (status == OK) {
+        unit->stepped = true;
+        unit->values.numbers[TIME] = time + size;
+    }
     return status;
+}
+
+static int set_start(struct unit *unit, double time)
+{
+    unit->values.numbers[TIME] = time;
+    return OK;
 }
 
 /* --- instances and values, for both versions --- */
@@ -146,6 +186,8 @@ static int clear(struct unit *unit)
     static const struct values start = {.numbers = START_NUMBERS, .texts = START_TEXTS};
     end(unit);
     unit->values = start;
+    unit->phase = PREPARING;
+    unit->stepped = false;
     return OK;
 }
 
@@ -181,39 +223,62 @@ static int set_text(struct unit *unit, uint32_t number, const char *text)
     return snprintf(unit->values.texts[number], TEXT_SIZE, "%s", text) < TEXT_SIZE ? OK : report(unit, ERROR, "a text is too long");
 }
 
-/* Getter and setter of a type: the values of COUNT variables, those from BEGIN on, by their references. */
-#define FOR_EACH(BEGIN, COUNT, BODY)                                                                                               \
+static int check_kind(struct unit *unit, uint32_t reference, enum kind kind)
+{
+    if (reference < NUMBERS + TEXTS && VARIABLES[reference].kind == kind) {
+        return OK;
+    }
+    return report(unit, ERROR, "value reference %u: not a variable of this type", (unsigned)reference);
+}
+
+static int check_settable(struct unit *unit, uint32_t reference, enum kind kind)
+{
+    if (check_kind(unit, reference, kind) != OK) {
+        return ERROR;
+    }
+    const struct variable *variable = &VARIABLES[reference];
+    if (variable->causality == INDEPENDENT) {
+        return report(unit, ERROR, "%s: cannot be set; it follows from the steps", variable->name);
+    }
+    if (variable->causality != INPUT && unit->phase != PREPARING) {
+        return report(unit, ERROR, "%s: not an input; it can be set only before the simulation begins", variable->name);
+    }
+    return OK;
+}
+
+/* Getter and setter of a type: the values of COUNT variables by their references. */
+#define FOR_EACH(CHECK, KIND, BODY)                                                                                                \
     for (size_t index = 0; index < count; ++index) {                                                                               \
-        const uint32_t variable = references[index] - (BEGIN);                                                                     \
-        if (variable >= (COUNT)) {                                                                                                 \
+        const uint32_t variable = references[index];                                                                               \
+        if (CHECK(unit, variable, KIND) != OK) {                                                                                   \
             return ERROR;                                                                                                          \
         }                                                                                                                          \
         BODY                                                                                                                       \
     }                                                                                                                              \
     return OK;
-#define ACCESS(VERSION, NAME, TYPE, BEGIN, COUNT, GET, SET, ...)                                                                   \
+#define ACCESS(VERSION, NAME, TYPE, KIND, GET, SET, ...)                                                                           \
     EXPORT int VERSION##Get##NAME(struct unit *unit, const uint32_t *references, size_t count, TYPE *values __VA_ARGS__)           \
     {                                                                                                                              \
-        FOR_EACH(BEGIN, COUNT, GET)                                                                                                \
+        FOR_EACH(check_kind, KIND, GET)                                                                                            \
     }                                                                                                                              \
     EXPORT int VERSION##Set##NAME(struct unit *unit, const uint32_t *references, size_t count, const TYPE *values __VA_ARGS__)     \
     {                                                                                                                              \
-        FOR_EACH(BEGIN, COUNT, SET)                                                                                                \
+        FOR_EACH(check_settable, KIND, SET)                                                                                        \
     }
-#define NUMBER(VERSION, NAME, TYPE, ...)                                                                                           \
-    ACCESS(VERSION, NAME, TYPE, 0u, NUMBERS, values[index] = (TYPE)unit->values.numbers[variable];,                                \
+#define NUMBER(VERSION, NAME, TYPE, KIND, ...)                                                                                     \
+    ACCESS(VERSION, NAME, TYPE, KIND, values[index] = (TYPE)unit->values.numbers[variable];,                                       \
            unit->values.numbers[variable] = (double)values[index];, __VA_ARGS__)
 #define TEXT(VERSION, ...)                                                                                                         \
-    ACCESS(VERSION, String, char *, NUMBERS, TEXTS, values[index] = unit->values.texts[variable];,                                 \
-           if (set_text(unit, variable, values[index]) != OK) { return ERROR; }, __VA_ARGS__)
+    ACCESS(VERSION, String, char *, STRING, values[index] = unit->values.texts[variable - NUMBERS];,                                  \
+           if (set_text(unit, variable - NUMBERS, values[index]) != OK) { return ERROR; }, __VA_ARGS__)
 #define SIZE , size_t size __attribute__((unused))
 
-NUMBER(fmi2, Real, double, )
-NUMBER(fmi2, Integer, int, )
-NUMBER(fmi2, Boolean, int, )
-NUMBER(fmi3, Float64, double, SIZE)
-NUMBER(fmi3, Int32, int32_t, SIZE)
-NUMBER(fmi3, Boolean, bool, SIZE)
+NUMBER(fmi2, Real, double, FLOAT64, )
+NUMBER(fmi2, Integer, int, INT32, )
+NUMBER(fmi2, Boolean, int, BOOLEAN, )
+NUMBER(fmi3, Float64, double, FLOAT64, SIZE)
+NUMBER(fmi3, Int32, int32_t, INT32, SIZE)
+NUMBER(fmi3, Boolean, bool, BOOLEAN, SIZE)
 TEXT(fmi2, )
 TEXT(fmi3, SIZE)
 
@@ -229,8 +294,7 @@ BOTH(Terminate, end(unit); return OK;)
 BOTH(Reset, return clear(unit);)
 EXPORT void fmi2FreeInstance(struct unit *unit) { drop(unit); }
 EXPORT void fmi3FreeInstance(struct unit *unit) { drop(unit); }
-NOTHING(fmi2SetDebugLogging) NOTHING(fmi2SetupExperiment) NOTHING(fmi2EnterInitializationMode)
-NOTHING(fmi3SetDebugLogging) NOTHING(fmi3EnterInitializationMode)
+NOTHING(fmi2SetDebugLogging) NOTHING(fmi2EnterInitializationMode) NOTHING(fmi3SetDebugLogging)
 UNSUPPORTED(fmi2CancelStep) UNSUPPORTED(fmi2DeSerializeFMUstate) UNSUPPORTED(fmi2FreeFMUstate) UNSUPPORTED(fmi2GetBooleanStatus)
 UNSUPPORTED(fmi2GetDirectionalDerivative) UNSUPPORTED(fmi2GetFMUstate) UNSUPPORTED(fmi2GetIntegerStatus)
 UNSUPPORTED(fmi2GetRealOutputDerivatives) UNSUPPORTED(fmi2GetRealStatus) UNSUPPORTED(fmi2GetStatus)
@@ -268,6 +332,12 @@ EXPORT void *fmi2Instantiate(const char *name, int type, const char *token, cons
     return type == 1 ? make(name, token, NULL, callbacks->logger, callbacks->environment) : NULL;
 }
 
+EXPORT int fmi2SetupExperiment(struct unit *unit, int has_tolerance, double tolerance, double start, int has_stop, double stop)
+{
+    (void)has_tolerance, (void)tolerance, (void)has_stop, (void)stop;
+    return set_start(unit, start);
+}
+
 EXPORT int fmi2DoStep(struct unit *unit, double time, double size, int is_new)
 {
     (void)is_new;
@@ -284,6 +354,13 @@ EXPORT void *fmi3InstantiateCoSimulation(const char *name, const char *token, co
 {
     (void)resources, (void)visible, (void)logging, (void)events, (void)early, (void)required, (void)count, (void)update;
     return make(name, token, log, NULL, environment);
+}
+
+EXPORT int fmi3EnterInitializationMode(struct unit *unit, bool has_tolerance, double tolerance, double start, bool has_stop,
+                                       double stop)
+{
+    (void)has_tolerance, (void)tolerance, (void)has_stop, (void)stop;
+    return set_start(unit, start);
 }
 
 EXPORT int fmi3DoStep(struct unit *unit, double time, double size, bool is_new, bool *event, bool *terminate, bool *early,

@@ -66,7 +66,7 @@ def variables(profile: str = "", command: str = "") -> list[Variable]:
         Variable("stars_detected", 0, "Stars in the image", "output"),
         Variable("stars_matched", 0, "Stars identified", "output"),
         Variable("exposure_unix_s", 0.0, "Middle of the exposure, by the device's clock", "output", "s", "time_of_exposure_s"),
-        Variable("exposure_s", 0.0, "Middle of the exposure, by the time of the emulator", "output", "s", "run_time_s"),
+        Variable("exposure_s", 0.0, "Middle of the exposure, by the time of the simulation", "output", "s", "run_time_s"),
         Variable("sigma_cross", 0.0, "Standard deviation about x and about y", "output", "arcsec", "sigma_cross_arcsec"),
         Variable("sigma_roll", 0.0, "Standard deviation about the boresight", "output", "arcsec", "sigma_roll_arcsec"),
         Variable("seed", 1, "Random seed", "parameter"),

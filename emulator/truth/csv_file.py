@@ -26,7 +26,7 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.feed_message import checked_attitude
-from starhil.emulator.truth.feed_rates import FeedError
+from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.plausibility import doubt_of_orbit
 from starhil.emulator.truth.source import MAX_RATE_DEG_S
@@ -79,8 +79,10 @@ def read_csv(path: Path, text: str) -> FileTruth:
     for number, line in lines[1:]:
         where = f"truth file {path} line {number}"
         row = _parse_row(where, columns, line)
-        if times and row["t"] <= times[-1]:
-            raise EmulatorError(f"{where}: t is not later than in the previous row")
+        if times and row["t"] - times[-1] < SHORTEST_S:
+            raise EmulatorError(
+                f"{where}: t is not later than in the previous row, by at least {SHORTEST_S:g} s"
+            )
         times.append(row["t"])
         attitudes.append(_attitude(where, needed, row))
         if has_orbit:

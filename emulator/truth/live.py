@@ -9,7 +9,7 @@ The first message (or the last one before time starts) sets the offset between t
 ``t`` is simulation time. A sender that runs at another speed than the clock is reported, and flagged ``wrong_speed``;
 each of its messages then holds from its receipt, with ``timeline = "run"`` still at its ``t``.
 
-Between two messages the attitude is interpolated. After the last one it is propagated at the last rate for at most
+Between two messages the attitude is interpolated, with the rates of both if the sender gives rates and times. After the last one it is propagated at the last rate for at most
 ``stale_s``; then it is held and flagged ``stale``. With ``timeline = "run"`` it is also stale if the last ``t`` is
 older than this.
 
@@ -25,7 +25,7 @@ from __future__ import annotations
 import bisect
 import logging
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -38,7 +38,7 @@ from starhil.emulator.truth.plausibility import doubt_of_date, doubt_of_orbit
 from starhil.emulator.truth.sender_clock import SenderClock, SenderSpeed
 from starhil.emulator.truth.simulator_42 import Format42
 from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus
-from starid.attitude import Attitude, interpolate, propagate
+from starid.attitude import Attitude, interpolate, interpolate_with_rates, propagate
 
 log = logging.getLogger("starhil.truth")
 
@@ -50,6 +50,17 @@ NEAR: Final = 0.05
 
 RESTART_S: Final = 1.0
 """Jump back of the sender's time that starts a new timeline, seconds."""
+
+
+@dataclass(frozen=True)
+class _HeldMessage:
+    """The truth of an accepted message."""
+
+    t: float
+    """Simulation time, seconds."""
+    state: TruthState
+    has_rate: bool
+    """Whether its rate is the sender's, at a time of the sender; otherwise it is derived, or its time is that of receipt."""
 
 
 class LiveTruth:
@@ -87,8 +98,7 @@ class LiveTruth:
         """Sender's time in the last message with a time."""
         self._received_s = 0.0
         """Simulation time at which the last message was accepted."""
-        self._times: deque[float] = deque(maxlen=HISTORY)
-        self._states: deque[TruthState] = deque(maxlen=HISTORY)
+        self._held: deque[_HeldMessage] = deque(maxlen=HISTORY)
 
     def set_run(self, clock_speed: float, start_unix_s: float) -> None:
         """Set the simulation time per wall time, by default 1, 0 if time passes only on request; and the date of the run."""
@@ -145,8 +155,8 @@ class LiveTruth:
                 self._speed_changed()
         self._drop_superseded(t, timed=timed)
         self._received_s = received_s
-        self._times.append(t)
-        self._states.append(TruthState(message.attitude, rate, orbit=message.orbit, unix_s=message.unix_s))
+        state = TruthState(message.attitude, rate, orbit=message.orbit, unix_s=message.unix_s)
+        self._held.append(_HeldMessage(t, state, has_rate=timed and message.rate_rad_s is not None))
         self._check_plausibility(message)
 
     def _check_plausibility(self, message: FeedMessage) -> None:
@@ -166,8 +176,7 @@ class LiveTruth:
     def _speed_changed(self) -> None:
         """Report a speed that differs from the clock's, and discard the states whose times no longer hold."""
         if self.timeline == "anchor":
-            self._times.clear()
-            self._states.clear()
+            self._held.clear()
         if self.speed.differs:
             wall = rounded_speed(self.speed.ratio * self._clock_speed)
             scaled = f"--clock scaled:{wall:g}, or " if wall <= MAX_SCALE else ""
@@ -180,9 +189,11 @@ class LiveTruth:
     def _repeats_the_last(self, message: FeedMessage) -> bool:
         """Return whether a message repeats the last one, as simulators do at their start."""
         return (
-            bool(self._states)
+            bool(self._held)
             and message.t == self._last_t
-            and np.array_equal(message.attitude.quaternion_xyzw, self._states[-1].attitude.quaternion_xyzw)
+            and np.array_equal(
+                message.attitude.quaternion_xyzw, self._held[-1].state.attitude.quaternion_xyzw
+            )
         )
 
     def _check_time(self, t: float) -> None:
@@ -196,22 +207,20 @@ class LiveTruth:
     def begin_timeline(self) -> None:
         """Discard the messages and the sender's clock: the sender has restarted, or the run has not begun."""
         self._last_t = None
-        self._times.clear()
-        self._states.clear()
+        self._held.clear()
         self._clock, self._rates = SenderClock(self._clock_speed), FeedRates(timed=True)
 
     def _drop_superseded(self, t: float, *, timed: bool) -> None:
         """Drop messages replaced by a new one: one received at the same time, or an abandoned timeline."""
-        if not self._times or t >= self._times[-1] + SHORTEST_S:
+        if not self._held or t >= self._held[-1].t + SHORTEST_S:
             return
-        if not timed and t >= self._times[-1]:
-            self._times.pop()
-            self._states.pop()
-        elif self._times[-1] - t > RESTART_S:
-            self._times.clear()
-            self._states.clear()
+        ahead_s = self._held[-1].t - t
+        if not timed and ahead_s <= 0.0:
+            self._held.pop()
+        elif ahead_s > RESTART_S:
+            self._held.clear()
         else:
-            raise FeedError(f"its time is {self._times[-1] - t:.3g} s before the previous message's")
+            raise FeedError(f"its time is {ahead_s:.3g} s before the previous message's")
 
     def state(self, t_s: float) -> TruthState:
         """Return the truth at a simulation time in seconds."""
@@ -225,21 +234,18 @@ class LiveTruth:
         return state
 
     def _state(self, t_s: float) -> TruthState:
-        if not self._times:
+        if not self._held:
             return TruthState(self._start, ZERO_RATE, TruthStatus.WAITING)
-        age = t_s - self._times[-1]
-        last = self._states[-1]
+        age, last = t_s - self._held[-1].t, self._held[-1].state
         silence = age if self.timeline == "run" else min(age, t_s - self._received_s)
         if silence > self.stale_s:
             return replace(_moved_on(last, self.stale_s), rate_rad_s=ZERO_RATE, status=TruthStatus.STALE)
         if age >= 0.0:
             return _moved_on(last, min(age, self.stale_s)) if age > 0.0 else last
-        if t_s <= self._times[0]:
-            return replace(self._states[0], status=TruthStatus.BEFORE_START)
-        upper = bisect.bisect_right(self._times, t_s)
-        low = upper - 1
-        span_s = self._times[upper] - self._times[low]
-        return _between(self._states[low], self._states[upper], (t_s - self._times[low]) / span_s, span_s)
+        if t_s <= self._held[0].t:
+            return replace(self._held[0].state, status=TruthStatus.BEFORE_START)
+        upper = bisect.bisect_right(self._held, t_s, key=lambda held: held.t)
+        return _between(self._held[upper - 1], self._held[upper], t_s)
 
 
 def rounded_speed(speed: float) -> float:
@@ -260,8 +266,10 @@ def _moved_on(last: TruthState, seconds: float) -> TruthState:
     )
 
 
-def _between(before: TruthState, after: TruthState, fraction: float, span_s: float) -> TruthState:
-    """Interpolate between two states that are `span_s` seconds apart."""
+def _between(first: _HeldMessage, second: _HeldMessage, t_s: float) -> TruthState:
+    """Interpolate between two messages at a simulation time in seconds."""
+    before, after, span_s = first.state, second.state, second.t - first.t
+    fraction = (t_s - first.t) / span_s
     orbit = None
     if before.orbit is not None and after.orbit is not None:
         orbit = interpolate_orbit(before.orbit, after.orbit, fraction, span_s)
@@ -269,5 +277,10 @@ def _between(before: TruthState, after: TruthState, fraction: float, span_s: flo
     if before.unix_s is not None and after.unix_s is not None:
         unix_s = before.unix_s + fraction * (after.unix_s - before.unix_s)
     rate = (1.0 - fraction) * before.rate_rad_s + fraction * after.rate_rad_s
-    attitude = interpolate(before.attitude, after.attitude, fraction)
+    if first.has_rate and second.has_rate:
+        attitude = interpolate_with_rates(
+            before.attitude, after.attitude, before.rate_rad_s, after.rate_rad_s, fraction, span_s
+        )
+    else:
+        attitude = interpolate(before.attitude, after.attitude, fraction)
     return TruthState(attitude, rate, orbit=orbit, unix_s=unix_s)

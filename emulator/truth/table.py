@@ -11,21 +11,16 @@ the attitude is held and flagged ``gap``, and there is no orbit.
 from __future__ import annotations
 
 import bisect
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.orbit import OrbitState, interpolate_orbit
-from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus, Vector
+from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus
 from starid.arrays import Array
-from starid.attitude import Attitude, interpolate, rate_between
-
-SMALL_TURN_RAD: Final = 1e-4
-"""Turn below which the coefficient of the second order in Bortz's equation is 1/12 to the last bit."""
+from starid.attitude import Attitude, interpolate, interpolate_with_rates, rate_between
 
 
 @dataclass(frozen=True)
@@ -128,10 +123,9 @@ class FileTruth:
         else:
             rate = (1.0 - fraction) * self.rates_rad_s[low] + fraction * self.rates_rad_s[low + 1]
         if self.smooth and self.rates_rad_s is not None:
-            turned = _turned(
+            attitude = interpolate_with_rates(
                 before, after, self.rates_rad_s[low], self.rates_rad_s[low + 1], fraction, length_s
             )
-            attitude = before.rotated(turned)
         else:
             attitude = interpolate(before, after, fraction)
         orbit = None
@@ -173,24 +167,3 @@ def _between(times: Array, t: float) -> tuple[int, float, float]:
     low = min(int(np.searchsorted(times, t, side="right")), len(times) - 1) - 1
     span = float(times[low + 1] - times[low])
     return low, (t - float(times[low])) / span, span
-
-
-def _turned(
-    before: Attitude, after: Attitude, rate_before: Vector, rate_after: Vector, fraction: float, span: float
-) -> Vector:
-    """Return the rotation vector (3,) from the row before: a cubic with the rates of both rows."""
-    turn = after.error_to(before).rotation_vector_rad
-    f, g = fraction, 1.0 - fraction
-    start, end = span * rate_before, span * _vector_rate(turn, rate_after)
-    return f * f * (3.0 - 2.0 * f) * turn + f * g * (g * start - f * end)
-
-
-def _vector_rate(turn: Vector, rate: Vector) -> Vector:
-    """Return the derivative of a rotation vector at a body rate (Bortz 1971, eq. 9)."""
-    angle = float(np.linalg.norm(turn))
-    second = 1.0 / 12.0
-    if angle > SMALL_TURN_RAD:
-        second = (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / angle**2
-    once = np.cross(turn, rate)
-    derivative: Vector = rate + 0.5 * once + second * np.cross(turn, once)
-    return derivative

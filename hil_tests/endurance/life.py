@@ -97,6 +97,8 @@ class Life:
     """The links that are open: `serial`, `can`, `canopen`."""
     profile: dict[str, Any]
     steps: tuple[Step, ...]
+    rendered: bool = False
+    """Whether every image is rendered and solved; otherwise an error model takes the place of the pipeline."""
 
 
 @dataclass
@@ -125,6 +127,7 @@ def make_life(
     count: int,
     *,
     is_long: bool = False,
+    rendered: bool = False,
 ) -> Life:
     """Generate a life of `count` steps."""
     random_of_life = random.Random(f"{unit} {seed}")  # noqa: S311 (reproducible, not secret)
@@ -142,7 +145,7 @@ def make_life(
     }
     used = tuple(link for link in links if random_of_life.random() < 0.6) or (random_of_life.choice(links),)
     generator = LifeGenerator(definition, used, random_of_life, is_long=is_long)
-    return Life(unit, seed, used, profile, tuple(islice(generator.steps(), count)))
+    return Life(unit, seed, used, profile, tuple(islice(generator.steps(), count)), rendered)
 
 
 class LifeGenerator:

@@ -172,10 +172,13 @@ class Bench:
 
     def read(self, name: str) -> dict:
         """Read telemetry in physical units."""
-        row = self.icd.telemetry[name]
-        (reply,) = self.requests.handle(self.icd.request(row))
+        return self.icd.telemetry[name].decode(self.data(name))
+
+    def data(self, name: str) -> bytes:
+        """Read the bytes of telemetry."""
+        (reply,) = self.requests.handle(self.icd.request(self.icd.telemetry[name]))
         assert reply.kind is ReplyKind.TELEMETRY, reply
-        return row.decode(reply.data)
+        return reply.data
 
     @property
     def mode(self) -> str:

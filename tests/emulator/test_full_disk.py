@@ -7,6 +7,7 @@ import pytest
 
 from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.launch import RunOptions
+from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import command, every_row_read
 
 FULL = 600
@@ -48,6 +49,24 @@ async def track_and_store(emulation):
     for _ in range(3):
         assert command(emulation, "save_parameters") not in (None, 0)
     return frames
+
+
+@pytest.mark.parametrize(
+    "command_line",
+    [
+        "fmu export -o made/unit.fmu",
+        "icd export c -o made",
+        "icd export html -o made/icd.html",
+        "unit new made/unit",
+    ],
+)
+def test_a_command_leaves_no_output_that_is_empty(command_line, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with full_disk():
+        status, _, said = run_command_line(*command_line.split())
+    assert status == 2
+    assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
 
 
 WRITERS = {

@@ -97,6 +97,16 @@ def test_a_run_is_repeated_to_the_byte(record, clock, tmp_path):
     assert (folder / "truth.csv").read_text().count("\n") >= 9
 
 
+def test_runs_with_other_state_folders_are_recorded_alike(tmp_path):
+    written = []
+    for name in ("one", "two"):
+        folder = tmp_path / f"{name}-recorded"
+        prepare_recording(folder, Profile(run={"state_dir": str(tmp_path / name)}), "")
+        written.append((folder / RUN_FILE).read_bytes())
+    assert written[0] == written[1]
+    assert read_run(folder)[0].run.state_dir == "state"
+
+
 def test_can_frames_and_canopen_are_repeated(record):
     bus = "virtual:recorded"
 

@@ -1,6 +1,7 @@
 """The worker is started before anything else is imported, and a kernel needs no whole `scipy.linalg`."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -37,6 +38,14 @@ print(np.array_equal(product(np.eye(3), np.eye(3)), np.eye(3)))
 def python(program):
     command = [sys.executable, "-c", program]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_before_the_event_loop_ends_a_run_as_a_later_one_does(number):
+    program = AHEAD.replace("raise KeyboardInterrupt", f"import signal; signal.raise_signal({int(number)})")
+    ended = python(program.format(arguments=["run", "ideal"]))
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith("worker")
 
 
 @pytest.mark.parametrize(

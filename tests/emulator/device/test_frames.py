@@ -1,5 +1,7 @@
 """Stars, timing and the rate of frames."""
 
+import struct
+
 import pytest
 
 from starhil.emulator.device.cycle import MAX_PENDING
@@ -48,6 +50,26 @@ def test_performance_and_timing_come_from_the_frame(bench):
     assert timing["capture_duration"] == round(100 + model.readout_s * 1e3)
     assert timing["detection_duration"] == round((model.detect_s + 40 * model.detect_per_star_s) * 1e3)
     assert timing["identification_duration"] == round(model.identify_lost_s * 1e3)
+
+
+def test_the_star_tracker_s_rows_are_laid_out_as_the_drivers_of_albertasat_and_cts_unpack_them(bench):
+    """Rows 187 to 189: bytes and words, little-endian, in the order of the two drivers' structures; durations in milliseconds."""
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(1.5)
+    model = Profile().timing
+    assert struct.unpack("<3H", bench.data("star_magnitudes")) == (
+        560,
+        2180,
+        2450,
+    )  # scale and offset are ours
+    detected, noise, invalid, identified, lost, dark = bench.data("star_performance_1")
+    assert (detected, invalid, identified, lost) == (40, 3, 35, 1)
+    assert (noise, dark) == (6, 8)  # units are ours
+    capture_ms, detection_ms, identification_ms = struct.unpack("<3H", bench.data("star_timing"))
+    assert capture_ms == round(100 + model.readout_s * 1e3)
+    assert detection_ms == round((model.detect_s + 40 * model.detect_per_star_s) * 1e3)
+    assert identification_ms == round(model.identify_lost_s * 1e3)
+    assert len({capture_ms, detection_ms, identification_ms}) == 3
 
 
 def test_a_result_is_known_only_after_its_modelled_latency(bench):

@@ -11,6 +11,7 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.truth.orbit import KeplerOrbit, OrbitState
 from starhil.emulator.truth.table import OrbitTable, Span
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.values import FieldError
 from starid.earth import earth_velocity
 
 NEW_YEAR = 1_767_225_600.0
@@ -96,9 +97,9 @@ def test_elements_in_parameters_give_an_orbit():
 
 
 def test_an_orbit_that_intersects_the_earth_is_refused(bench):
-    with pytest.raises(Exception, match="intersects the Earth"):
+    with pytest.raises(FieldError, match=r"orbit_semi_major_axis: .*intersects the Earth"):
         bench.device.parameters.set({"orbit_semi_major_axis": 6000.0})
-    with pytest.raises(Exception, match="intersects the Earth"):
+    with pytest.raises(FieldError, match=r"orbit_semi_major_axis: .*intersects the Earth"):
         bench.device.parameters.set({"orbit_semi_major_axis": 7000.0, "orbit_eccentricity": 0.2})
     bench.device.parameters.set({"orbit_semi_major_axis": 26600.0, "orbit_eccentricity": 0.7})
 

@@ -149,6 +149,7 @@ def test_file_takes_angles_rates_and_repeats(tmp_path):
         ("t,qx,qy,qz,qw\n0,0,0,0,1\n1,0,0,x,1\n", "line 3: qz is not a number"),
         ("t,qx,qy,qz,qw\n0,0,0,0,1\n# c\n1,0,0,1\n", "line 4: 4 values for 5 columns"),
         ("t,qx,qy,qz,qw\n0,0,0,0,1\n0,0,0,0,1\n", "line 3: t is not later"),
+        ("t,qx,qy,qz,qw\n0,0,0,0,1\n1e-320,0,0,1,0\n", "line 3: t is not later"),
         ("t,qx,qy,qz,qw\n0,0,0,0,2\n", "line 2: the quaternion is not of length 1"),
         ("t,qx,qy,qz,qw\n0,0,0,0,nan\n", "line 2: qw is not a number"),
         ("t,ra_deg,dec_deg,roll_deg\n0,0,91,0\n", "line 2: dec_deg is outside"),
@@ -241,6 +242,27 @@ def test_live_feed_interpolates_extrapolates_and_goes_stale():
     assert stale.status is TruthStatus.STALE
     assert apart_arcsec(stale.attitude, propagate(ORION, rate, 2.0)) < MILLIARCSECOND
     assert not stale.rate_rad_s.any()
+
+
+def test_between_distant_messages_a_live_feed_follows_their_rates():
+    """Coning: a spin about z in a frame that turns about x; both rates are constant there."""
+
+    def coning(t):
+        turned = propagate(propagate(EAST, np.radians([0.2, 0.0, 0.0]), t), np.radians([0.0, 0.0, 1.5]), t)
+        angle = np.radians(1.5 * t)
+        rate = [0.2 * np.cos(angle), -0.2 * np.sin(angle), 1.5]  # the first turn, as seen after the second
+        return turned, rate
+
+    with_rates, without = (LiveTruth(EAST, timeline="run", stale_s=5.0) for _ in range(2))
+    for t in (0.0, 5.0):
+        attitude, rate = coning(t)
+        assert with_rates.receive(line(t, attitude, rate), t), with_rates.last_fault
+        assert without.receive(line(t, attitude), t)
+    for t in (1.0, 2.5, 4.2):
+        attitude, rate = coning(t)
+        assert np.degrees(with_rates.state(t).rate_rad_s) == pytest.approx(rate, abs=1e-3)
+        assert apart_arcsec(with_rates.state(t).attitude, attitude) < 0.1
+        assert apart_arcsec(without.state(t).attitude, attitude) > 30.0
 
 
 def test_live_feed_takes_the_rate_from_its_messages_and_the_time_from_their_receipt():

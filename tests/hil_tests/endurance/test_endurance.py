@@ -1,15 +1,21 @@
 """Random lives of units: none ends in a violation, the same seed gives the same life, and what fails is written."""
 
 import asyncio
+import json
+import os
+import shlex
+import subprocess
+import sys
 import tomllib
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 
 import pytest
 
-from starhil.emulator.cli.endurance import live, read_life, run_once, write_life
+from starhil.emulator.cli import endurance
+from starhil.emulator.cli.endurance import live, live_from_seed, read_life, run_once, write_life
 from starhil.emulator.device.counters import Counters
 from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.quantities import QUANTITIES
@@ -20,13 +26,14 @@ from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.replay import replay
 from starhil.hil_tests.endurance.attitude_judge import Motion
-from starhil.hil_tests.endurance.life import UNRECORDED, Life, make_life
+from starhil.hil_tests.endurance.life import UNRECORDED, Life, Outcome, make_life
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.violating_life import kind_of, shortened
 from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.codec import Row
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import bundled_units
+from tests.emulator.cli.command_line import run_command_line
 
 LIVES, STEPS = 4, 150
 ROOT = Path(__file__).parents[3]
@@ -48,7 +55,7 @@ def test_no_life_ends_in_a_violation(unit):
 
 
 def test_a_life_whose_images_are_rendered_ends_without_a_violation():
-    outcome = run_once(life_of("sagitta", 5, 25), rendered=True)
+    outcome = run_once(replace(life_of("sagitta", 5, 25), rendered=True))
     assert outcome.violation == ""
 
 
@@ -61,8 +68,7 @@ def test_a_rendering_process_that_is_killed_is_an_error_until_its_successor_is_r
         {"do": "wait", "s": 3.0},
         READ_MODE,
     )
-    life = replace(life_of("cubestar", 1, 1), links=("serial",), profile={}, steps=steps)
-    outcome = run_once(life, rendered=True)
+    outcome = run_once(Life("cubestar", 1, ("serial",), {}, steps, rendered=True))
     assert (outcome.violation, outcome.readings) == ("", 3)
 
 
@@ -212,7 +218,61 @@ def test_telemetry_that_is_streamed_to_a_former_address_is_found(monkeypatch):
 def test_a_seed_gives_one_life_and_one_outcome():
     assert life_of("cubestar", 3) == life_of("cubestar", 3)
     assert life_of("cubestar", 3) != life_of("cubestar", 4)
-    assert asdict(run_once(life_of("oresat", 3))) == asdict(run_once(life_of("oresat", 3)))
+    program = (
+        "from tests.hil_tests.endurance.test_endurance import life_of, run_once\n"
+        "print(life_of('cubestar', 3), run_once(life_of('oresat', 3)), sep='\\n')"
+    )
+    first, second = (
+        subprocess.run(
+            [sys.executable, "-c", program],
+            cwd=ROOT,
+            env={**os.environ, "PYTHONHASHSEED": seed},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for seed in ("1", "2")
+    )
+    assert first == second
+    assert "Outcome(violation='', step=149" in first
+
+
+@pytest.mark.parametrize("kind", ["usual", "long", "rendered"])
+def test_the_printed_command_repeats_the_life(kind, monkeypatch, tmp_path):
+    outcome = Outcome(violation="a violation", step=0)
+    monkeypatch.setattr(endurance, "run_once", lambda *_life, **_record: outcome)
+    monkeypatch.setattr(endurance, "write_life", lambda *_arguments: [])
+    lives = []
+    monkeypatch.setattr(endurance, "live", lambda life, folder: lives.append(life) or live(life, folder))
+
+    def run_here(plan, folder):
+        return [live_from_seed(*item, folder) for item in plan.plan()]
+
+    monkeypatch.setattr(endurance, "_run", run_here)
+    periods = {f"--{name}": "1" if name == kind else "0" for name in ("rendered", "long")}
+    typed = ["--unit", "sagitta", "--seed", "7", "--lives", "1", "--steps", "37", "-o", str(tmp_path)]
+    status, said, _ = run_command_line("endurance", *typed, *chain(*periods.items()))
+    assert status == 1
+    (command,) = [text for text in said.splitlines() if text.startswith("  starhil endurance")]
+    assert run_command_line(*shlex.split(command)[1:])[0] == 1
+    first, again = lives
+    assert first == again
+    assert (len(first.steps) == 37, first.rendered) == (kind == "usual", kind == "rendered")
+
+
+def test_a_life_in_a_file_is_repeated_as_it_was(tmp_path, monkeypatch):
+    life = Life("cubestar", 1, ("serial",), {}, (READ_MODE,), rendered=True)
+    file, *_, recording = write_life(life, "a violation", tmp_path)
+    assert read_life(file) == life
+    assert json.loads((recording / "run.json").read_text())["profile"]["run"]["worker"] == "process"
+    lives = []
+    monkeypatch.setattr(
+        endurance, "run_once", lambda life: lives.append(life) or Outcome(violation="again", step=0)
+    )
+    monkeypatch.setattr(endurance, "write_life", lambda *_arguments: [])
+    status, said, _ = run_command_line("endurance", "--life", str(file), "-o", str(tmp_path))
+    assert (status, lives) == (1, [life])
+    assert f"  starhil endurance --life {file}" in said
 
 
 @pytest.fixture
@@ -233,7 +293,7 @@ def violating(unit):
 def test_a_defect_is_found_shortened_written_and_repeated(forgetful, tmp_path):
     life, violation = violating("cubestar")
     assert "count" in violation
-    figures = live("cubestar", life, rendered=False, folder=tmp_path)
+    figures = live(life, tmp_path)
     assert figures["steps"] < 12
     written = read_life(tmp_path / f"cubestar-{life.seed}.json")
     assert kind_of(run_once(written).violation) == kind_of(violation)
