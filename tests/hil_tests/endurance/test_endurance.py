@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from starhil.emulator.cli.endurance import live, read_life, run_once, write_life
+from starhil.emulator.device.actions import ACTIONS
 from starhil.emulator.device.counters import Counters
 from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.quantities import QUANTITIES
@@ -219,10 +220,10 @@ def test_a_seed_gives_one_life_and_one_outcome():
 def forgetful(monkeypatch):
     """A unit that does not clear its counter of telemetry requests."""
 
-    def clear(self):
-        self.telecommands = 0
+    def clear(device, _arguments):
+        device.counters = Counters(telemetry=device.counters.telemetry)
 
-    monkeypatch.setattr(Counters, "clear", clear)
+    monkeypatch.setitem(ACTIONS, "clear_counters", clear)
 
 
 def violating(unit):
