@@ -318,21 +318,14 @@ class CanopenLink(BusLink[CanFrame]):
         self._notify_rows(rows)
 
     def _mode_changed(self, transition: Transition) -> None:
+        errors = self._device.icd.enum("device_error")
         if transition.after is Mode.ERROR:
-            # The cause of the error is set only after the mode has changed.
-            self._device.scheduler.at(self._device.clock.now_ns(), self._device_failed)
-            return
-        if transition.before is Mode.ERROR:
-            for number in self._device.icd.enum("device_error").names:
+            code = DEVICE_ERROR + errors.values.get(self._device.modes.error, 0)
+            self._run_action(partial(self.slave.raise_emergency, code, ErrorRegister.MANUFACTURER))
+        elif transition.before is Mode.ERROR:
+            for number in errors.names:
                 self._run_action(partial(self.slave.clear_emergency, DEVICE_ERROR + number))
         self._notify_rows(self._status_rows)
-
-    def _device_failed(self, _due_ns: int) -> None:
-        numbers = self._device.icd.enum("device_error").values
-        code = DEVICE_ERROR + numbers.get(self._device.modes.error, 0)
-        if self._device.modes.mode is Mode.ERROR:
-            self._run_action(partial(self.slave.raise_emergency, code, ErrorRegister.MANUFACTURER))
-            self._notify_rows(self._status_rows)
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "canopen_node" in names and self._wanted_node != self.slave.node_id:

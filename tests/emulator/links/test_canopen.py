@@ -300,9 +300,10 @@ def test_image_that_was_stored(linked):
 
 def test_error_mode_is_an_emergency(linked):
     def test(link):
+        link.take()
         link.device.modes.fail("sensor")
         number = link.bench.icd.enums["device_error"].values["sensor"]
-        assert [frame for frame in link.step(0.1) if frame[0] == 0x80 + NODE] == [
+        assert [frame for frame in link.take() if frame[0] == 0x80 + NODE] == [
             (0x80 + NODE, f"{number:02x}ff810000000000")
         ]
         link.bench.command("set_mode", mode="standby")
