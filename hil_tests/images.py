@@ -229,7 +229,7 @@ async def _gather(client: AsyncObcClient, packets: dict[int, bytes], count: int)
 
 async def _send_hole_map(client: AsyncObcClient, packets: dict[int, bytes]) -> None:
     """Send the device the map of the packets that have arrived."""
-    holes = HoleMap(packets)
+    holes = HoleMap.of(packets)
     for part in range(1, MAP_PARTS + 1):
         await client.command(f"set_hole_map_{part}", {"map": holes.part(part)})
 

@@ -28,8 +28,8 @@ class Conventions(DefinitionModel):
     quaternion: Literal["rotation", "attitude"] = "rotation"
     """`rotation`: v_sensor = q v q*; `attitude`: the conjugate, the q of an attitude matrix A(q)."""
     scalar_sign: Literal["positive", "any"] = "positive"
-    """`positive`: the scalar part is never negative; `any`: the sign that gives the quaternion closer to the
-    last reported one."""
+    """`positive`: the scalar part is never negative; `any`: the sign that gives the quaternion closer to that of
+    the last valid frame."""
     axes: list[Axis] = Field(default=SENSOR_AXES, min_length=3, max_length=3)
     """Axes of the reported frame in the sensor frame (+x right in the image, +y down, +z boresight)."""
     epoch: str = "unix"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import binascii
 import struct
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Final
 
 from starhil.protocol.errors import ProtocolError
@@ -65,18 +66,24 @@ def parse_burst_packet(packet: bytes) -> tuple[int, bytes]:
     return number, data
 
 
+@dataclass(frozen=True)
 class HoleMap:
     """Which packets of a block have arrived: bit n of part k (from 1) is packet 128 (k - 1) + n."""
 
-    def __init__(self, arrived: Iterable[int] = ()) -> None:
-        self._bits = bytearray(MAP_PARTS * MAP_PART_SIZE)
+    bits: bytes = bytes(MAP_PARTS * MAP_PART_SIZE)
+
+    @classmethod
+    def of(cls, arrived: Iterable[int]) -> HoleMap:
+        """Return the map of these packets; numbers that it does not cover are left out."""
+        bits = bytearray(MAP_PARTS * MAP_PART_SIZE)
         for number in arrived:
             if 0 <= number < MAX_PACKETS:
-                self._bits[number // 8] |= 1 << number % 8
+                bits[number // 8] |= 1 << number % 8
+        return cls(bytes(bits))
 
     def __contains__(self, number: int) -> bool:
         """Return whether a packet has arrived."""
-        return 0 <= number < MAX_PACKETS and bool(self._bits[number // 8] >> number % 8 & 1)
+        return 0 <= number < MAX_PACKETS and bool(self.bits[number // 8] >> number % 8 & 1)
 
     def missing(self, count: int) -> Iterator[int]:
         """Return the numbers below `count` of packets that have not arrived."""
@@ -84,13 +91,14 @@ class HoleMap:
 
     def part(self, part: int) -> bytes:
         """Return the 16 bytes of a part; parts count from 1."""
-        return bytes(self._bits[self._span(part)])
+        return self.bits[self._span(part)]
 
-    def set_part(self, part: int, data: bytes) -> None:
-        """Replace the 16 bytes of a part; parts count from 1."""
+    def with_part(self, part: int, data: bytes) -> HoleMap:
+        """Return the map with other 16 bytes in a part; parts count from 1."""
         if len(data) != MAP_PART_SIZE:
             raise ProtocolError(f"hole map part of {len(data)} bytes, must be {MAP_PART_SIZE}")
-        self._bits[self._span(part)] = data
+        span = self._span(part)
+        return HoleMap(self.bits[: span.start] + data + self.bits[span.stop :])
 
     @staticmethod
     def _span(part: int) -> slice:

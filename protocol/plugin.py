@@ -6,14 +6,14 @@ Example of `unit.py` beside the TOML files of a unit with `plugin = "unit.py"` i
 
     @quantity("battery.voltage", unit="V")
     def battery_voltage(snapshot):
-        return 3.7
+        return 3.6 if snapshot.mode.makes_frames else 3.7
 
     @action("blink")
     def blink(device, arguments):
         device.reset("command")
 
-The function of a quantity is called with a `starhil.emulator.device.snapshot.Snapshot` of the device. The
-function of an action is called with the device and the arguments by name; it returns nothing, messages that
+The function of a quantity is called with a `starhil.emulator.device.snapshot.Snapshot`, the device at one moment, from
+which the whole row is packed: it has neither the device nor a clock. docs/quantities.md lists its fields. The function of an action is called with the device and the arguments by name; it returns nothing, messages that
 follow the answer, or `bytes`, which are the data of the answer; a list of `bytes` makes several answers.
 A framing is a class derived from `starhil.protocol.framings.Framing`, whose constructor takes no arguments; a
 check is a function that returns the check of the covered bytes. docs/your-unit.md has an example of each.

@@ -460,6 +460,49 @@ def quantities() -> str:
     return table(rows, ("quantity", "type", "unit", "meaning"))
 
 
+def snapshot() -> str:
+    """What a custom quantity can read: a snapshot, and the records in it."""
+    from starhil.emulator.device.counters import Acknowledge, Counters
+    from starhil.emulator.device.measurement import Measurement
+    from starhil.emulator.device.parameters import ParameterState
+    from starhil.emulator.device.power import FrameTiming, ThermalState
+    from starhil.emulator.device.reported import Reported
+    from starhil.emulator.device.snapshot import Constants, Snapshot
+    from starhil.emulator.device.stored_images import FileState, ImageState, StoredImage
+    from starhil.emulator.pipeline.messages import FrameResult, MatchedStar
+
+    return "\n\n".join(
+        f"### `{kind.__name__}`\n\n{plain_text((kind.__doc__ or '').splitlines()[0])}\n\n"
+        + table(record_rows(kind), ("field", "type", "meaning"))
+        for kind in (
+            *(
+                Snapshot,
+                Constants,
+                Measurement,
+                FrameResult,
+                MatchedStar,
+                Reported,
+                FrameTiming,
+                ThermalState,
+            ),
+            *(ParameterState, Counters, Acknowledge, ImageState, FileState, StoredImage),
+        )
+    )
+
+
+def record_rows(kind: type) -> list[Row]:
+    """Return a row for each field and each computed value of a record."""
+    texts = attribute_docstrings(kind, grouped=True)
+    types = {field.name: str(field.type) for field in dataclasses.fields(kind)}
+    for name, item in vars(kind).items():
+        function = (
+            getattr(item, "fget", None) or getattr(item, "function", None) or getattr(item, "func", None)
+        )
+        if function is not None:
+            types[name], texts[name] = function.__annotations__["return"], plain_text(item.__doc__)
+    return [(f"`{name}`", f"`{types[name]}`", texts[name]) for name in types]
+
+
 def model_quantities() -> str:
     """Every quantity of the device, as TOML."""
     from starhil.emulator.device.quantities import QUANTITIES
@@ -564,7 +607,7 @@ TABLES: Final[dict[str, Callable[[], str]]] = {
     function.__name__: function
     for function in (
         *(actions, commands, device_parameters, faults, identifier, model_quantities, orbit, profile),
-        *(quantities, scenario, sensor, sky, truth, unit_definition),
+        *(quantities, scenario, sensor, sky, snapshot, truth, unit_definition),
     )
 }
 """Name of a table in a page → function that writes it."""

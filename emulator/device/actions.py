@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.counters import Counters
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.images import edge_of
 from starhil.emulator.device.modes import Mode
@@ -65,11 +66,11 @@ def set_parameters(device: Device, arguments: Arguments) -> None:
 def open_image(device: Device, arguments: Arguments) -> PendingAnswer[ErrorCode] | None:
     """Open an image for download in numbered chunks."""
     images = device.images
-    if images.busy:
+    if images.state.busy:
         raise Refused(ErrorCode.BUSY)
     edge = edge_of(str(arguments["image_size"]))
     if int(arguments["sram"]) == SRAM_STORED:
-        if images.stored is None:
+        if images.state.stored is None:
             raise Refused(ErrorCode.SEQUENCE)
         if not images.open_stored(edge):
             raise Refused(ErrorCode.INVALID_PARAMETER, argument="image_size")
@@ -81,14 +82,14 @@ def open_image(device: Device, arguments: Arguments) -> PendingAnswer[ErrorCode]
 
 def load_image_chunk(device: Device, arguments: Arguments) -> None:
     """Load a chunk of the open image."""
-    images = device.images
+    images, number = device.images.state, int(arguments["number"])
     if images.busy and images.download is None:
         raise Refused(ErrorCode.BUSY)
     if images.download is None:
         raise Refused(ErrorCode.SEQUENCE)
-    if int(arguments["number"]) >= images.frames:
+    if number >= images.chunks:
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="number")
-    images.frame = int(arguments["number"])
+    device.images.load_chunk(number)
 
 
 def save_image(device: Device, arguments: Arguments) -> None:
@@ -97,7 +98,7 @@ def save_image(device: Device, arguments: Arguments) -> None:
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="camera")
     if device.modes.mode in {Mode.BOOT, Mode.ERROR}:
         raise Refused(ErrorCode.SEQUENCE)
-    if device.images.busy:
+    if device.images.state.busy:
         raise Refused(ErrorCode.BUSY)
     device.images.save(edge_of(str(arguments["image_size"])))
 
@@ -145,7 +146,7 @@ def default_parameters(device: Device, _arguments: Arguments) -> None:
 
 def clear_counters(device: Device, _arguments: Arguments) -> None:
     """Clear the counters and flags of the links."""
-    device.counters.clear()
+    device.counters = Counters()
 
 
 def subscribe(device: Device, arguments: Arguments) -> None:
@@ -202,7 +203,7 @@ def load_file_block(device: Device, arguments: Arguments) -> None:
 
 def start_burst(device: Device, arguments: Arguments) -> list[Reply]:
     """Send the loaded block in packets."""
-    if not device.files.ready:
+    if not device.files.state.block:
         raise Refused(ErrorCode.SEQUENCE)
     return device.files.burst(ignore_hole_map=bool(arguments["ignore_hole_map"]))
 
@@ -214,7 +215,7 @@ def next_packet(device: Device, _arguments: Arguments) -> None:
 
 def set_hole_map(device: Device, arguments: Arguments) -> None:
     """Report which packets have arrived."""
-    device.files.arrived.set_part(int(arguments["section"]), bytes(arguments["map"]))
+    device.files.set_hole_map(int(arguments["section"]), bytes(arguments["map"]))
 
 
 ACTIONS: Final[dict[str, Action]] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 from starhil.emulator.device.actions import ACTIONS, PARAMETERS, Action, Outcome
@@ -33,21 +34,22 @@ class TelemetryBinding:
             if (getter := _field_getter(field, icd)) is not None
         ]
 
-    def encode(self, device: Device) -> bytes:
-        """Return the current bytes of the row; numbers beyond the range of a field are clipped, or wrap.
+    def encode(self, snapshot: Snapshot) -> bytes:
+        """Return the bytes of the row at one moment; numbers beyond the range of a field are clipped, or wrap.
 
-        Raises Refused if the row cannot be read now.
+        Raises Refused if the row cannot be read then.
         """
-        snapshot = Snapshot(device)
         values: dict[str, Value] = {}
         for name, getter in self._getters:
             value = getter(snapshot)
             if value is not None:
                 values[name] = value
-        data = self.row.encode(values, saturate=True)
+        return self.row.encode(values, saturate=True)
+
+    def follow(self, device: Device) -> None:
+        """Perform the action of the row, if it has one, which follows its reading."""
         if self._after is not None:
             self._after(device, self.row.arguments)
-        return data
 
 
 def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
@@ -83,7 +85,7 @@ def _health(given: Getter, field: Field, icd: InterfaceDefinition) -> Getter:
 
 def _accepted(telecommand: str, name: str) -> Getter:
     """Return the getter for a last accepted value of a telecommand."""
-    return lambda shot: shot.device.accepted.get(telecommand, {}).get(name)
+    return lambda shot: shot.accepted.get(telecommand, {}).get(name)
 
 
 def _scaled(getter: Getter, scale: float) -> Getter:
@@ -162,7 +164,7 @@ class TelecommandBinding:
                 refused.index = self._index.get(refused.argument, 0)
             raise
         if self._reported:
-            device.accepted[self.row.name] = values
+            device.accepted = MappingProxyType({**device.accepted, self.row.name: MappingProxyType(values)})
         return outcome
 
     def _without_crc(self, data: bytes) -> bytes:

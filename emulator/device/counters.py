@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Final
 
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault
@@ -21,44 +23,47 @@ _FLAG_OF_FAULT: Final[dict[FaultKind, str]] = {
 }
 
 
-@dataclass
+@dataclass(frozen=True)
 class Counters:
-    """Counters and flags of the links since they were last cleared."""
+    """Counters and flags of the links since they were last cleared; whatever is counted makes new ones."""
 
     telecommands: int = 0
+    """Telecommands received."""
     telemetry: int = 0
-    flags: set[str] = field(default_factory=set)
+    """Telemetry requests received."""
+    flags: frozenset[str] = frozenset()
     """Names of the flags in communication_status that are set."""
-    faults: dict[FaultKind, int] = field(default_factory=dict)
+    faults: Mapping[FaultKind, int] = field(default_factory=lambda: MappingProxyType({}))
     """Number of faults of each kind, for the log and the control channel."""
 
-    def count_fault(self, fault: LinkFault) -> None:
+    def with_telecommand(self) -> Counters:
+        """Count a telecommand."""
+        return Counters((self.telecommands + 1) & 0xFFFF, self.telemetry, self.flags, self.faults)
+
+    def with_telemetry(self) -> Counters:
+        """Count a telemetry request."""
+        return Counters(self.telecommands, (self.telemetry + 1) & 0xFFFF, self.flags, self.faults)
+
+    def with_fault(self, fault: LinkFault) -> Counters:
         """Count input that was not a valid message."""
-        self.faults[fault.kind] = self.faults.get(fault.kind, 0) + 1
-        self.flags.add(_FLAG_OF_FAULT[fault.kind])
+        faults = {**self.faults, fault.kind: self.faults.get(fault.kind, 0) + 1}
+        flags = self.flags | {_FLAG_OF_FAULT[fault.kind]}
+        return replace(self, flags=flags, faults=MappingProxyType(faults))
 
-    def overrun(self) -> None:
+    def with_overrun(self) -> Counters:
         """Set the flag for a telecommand that arrived before the previous one was done."""
-        self.flags.add("telecommand_overrun")
-
-    def clear(self) -> None:
-        """Set everything to zero."""
-        self.telecommands = self.telemetry = 0
-        self.flags.clear()
-        self.faults.clear()
+        return replace(self, flags=self.flags | {"telecommand_overrun"})
 
 
-@dataclass
+@dataclass(frozen=True)
 class Acknowledge:
     """Outcome of the last telecommand."""
 
     last_telecommand: int = 0
+    """ID of the telecommand; 0 before the first."""
     processed: bool = True
+    """Whether it has been processed."""
     error: ErrorCode = ErrorCode.OK
+    """Its result."""
     parameter_index: int = 0
-
-    def end(self, error: ErrorCode = ErrorCode.OK, parameter_index: int = 0) -> None:
-        """Record the outcome."""
-        self.processed = True
-        self.error = error
-        self.parameter_index = parameter_index
+    """Index of the field because of which it was refused with `invalid_parameter`."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from functools import reduce
+from types import MappingProxyType
 from typing import Any, Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS, Clock, DeviceTime
@@ -17,8 +18,10 @@ from starhil.emulator.device.modes import Mode, Modes, Transition
 from starhil.emulator.device.parameters import Parameters, ParameterValue
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.power import PowerModel, ThermalModel
+from starhil.emulator.device.reported import reported
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.signals import Signals
+from starhil.emulator.device.snapshot import Constants, Snapshot
 from starhil.emulator.device.state_store import StateStore
 from starhil.emulator.device.subscriptions import Subscriptions
 from starhil.emulator.device.surroundings import Surroundings
@@ -47,6 +50,8 @@ STALE_PERIODS: Final = 3
 """Number of update periods without a new measurement after which the last attitude is no longer valid."""
 
 PROCESSING_ALLOWANCE_S: Final = 2.0
+
+NOTHING_ACCEPTED: Final[Mapping[str, Mapping[str, Value]]] = MappingProxyType({})
 
 PIPELINE_ENDED: Final = "pipeline_ended"
 """Name in `device_error` for a pipeline that has ended and is not restarted."""
@@ -119,10 +124,10 @@ class Device:
         self.stored = Output("state")
         """The writes to the store."""
         self.latest: Measurement | None = None
-        self.reported_quaternion: Quaternion = IDENTITY
-        """The last valid quaternion that was reported, for the sign of the next one."""
+        self.last_quaternion: Quaternion = IDENTITY
+        """Quaternion of the last valid frame, for the sign of the next one."""
         self.selected_parameter = next(iter(icd.parameters_by_id), 0)
-        self.accepted: dict[str, Mapping[str, Value]] = {}
+        self.accepted: Mapping[str, Mapping[str, Value]] = NOTHING_ACCEPTED
         """Last accepted values of the telecommands that telemetry reports."""
         self.boot_count = 0
         self.reset_cause = "power_on"
@@ -135,8 +140,14 @@ class Device:
         """Whether the pipeline is ready."""
         self.unresponsive = False
         """Whether the device is unresponsive: requests are neither counted nor answered."""
-        self.rate_fields = rate_fields(icd)
-        """Integer fields that report a body rate: field, axis, and factor from rad/s to the field's unit."""
+        self._constants = Constants(
+            conventions=icd.conventions,
+            identity=profile.device,
+            health=MappingProxyType(dict(profile.health)),
+            image_size=(profile.camera.width, profile.camera.height),
+            power=self.power,
+            rate_fields=rate_fields(icd),
+        )
         self._background = background
         self._boot_end: Event | None = None
         self._stored_parameters: dict[str, object] = {}
@@ -165,14 +176,14 @@ class Device:
         self.cycle.reset()
         self.images.clear()
         self.files.clear()
-        self.counters.clear()
+        self.counters = Counters()
         self.acknowledge = Acknowledge()
         self.latest = None
         self.selected_parameter = next(iter(self.icd.parameters_by_id), 0)
         self.started_ns = self.clock.now_ns()
         self.time.offset_ns = round(self.profile.run.start_unix_s * NANOSECONDS) - self.started_ns
         self.time.was_set = False
-        self.accepted.clear()
+        self.accepted = NOTHING_ACCEPTED
         self.modes.reset()
         self.mode_changes = self.frames_valid = self.valid_in_a_row = 0
         self.thermal.start(self.started_ns, self.power.mean_power_w(self.cycle.timing))
@@ -261,22 +272,61 @@ class Device:
         """Return the state that survives a restart, including writes in progress."""
         return {"boot_count": self.boot_count, "parameters": self._stored_parameters}
 
+    # --- what is reported ---
+
+    def snapshot(self) -> Snapshot:
+        """Return the device at this moment: whatever a message contains comes from one snapshot."""
+        now_ns = self.clock.now_ns()
+        return Snapshot(
+            constants=self._constants,
+            now_ns=now_ns,
+            uptime_ns=now_ns - self.started_ns,
+            unix_ns=self.time.unix_ns(now_ns),
+            clock_set=self.time.was_set,
+            reset_cause=self.reset_cause,
+            boot_count=self.boot_count,
+            mode=self.modes.mode,
+            error=self.modes.error,
+            mode_changes=self.mode_changes,
+            frame=self._fresh(now_ns),
+            frames=self.cycle.published,
+            frames_valid=self.frames_valid,
+            valid_in_a_row=self.valid_in_a_row,
+            last_quaternion=self.last_quaternion,
+            timing=self.cycle.timing,
+            thermal=self.thermal.state,
+            parameters=self.parameters.state,
+            selected=self.icd.parameters_by_id.get(self.selected_parameter),
+            selected_id=self.selected_parameter,
+            store_fault=self.store.corrupt,
+            accepted=self.accepted,
+            counters=self.counters,
+            acknowledge=self.acknowledge,
+            images=self.images.state,
+            files=self.files.state,
+        )
+
     # --- frames ---
 
-    @property
-    def fresh(self) -> Measurement | None:
-        """The last measurement, or None if it is outdated or no images are taken in this mode."""
+    def _fresh(self, now_ns: int) -> Measurement | None:
+        """Return the last measurement, or None if it is outdated or no images are taken in this mode."""
         last = self.latest
         if last is None or not self.modes.mode.makes_frames:
             return None
         limit_s = STALE_PERIODS * last.period_s + PROCESSING_ALLOWANCE_S
-        age_ns = self.clock.now_ns() - last.published_ns
+        age_ns = now_ns - last.published_ns
         return last if age_ns <= limit_s * NANOSECONDS else None
 
     def _frame_published(self, measurement: Measurement) -> None:
         self.latest = measurement
         self.frames_valid += measurement.valid
         self.valid_in_a_row = self.valid_in_a_row + 1 if measurement.valid else 0
+        conventions = self.icd.conventions
+        if measurement.valid and conventions.scalar_sign == "any":
+            report = reported(
+                measurement, self.modes.mode, self.parameters, conventions, self.last_quaternion
+            )
+            self.last_quaternion = report.quaternion_xyzw
         self.modes.solved(
             valid=measurement.valid,
             tracked=measurement.mode is Mode.TRACKING,
@@ -311,15 +361,15 @@ class Device:
         self.thermal.set_power(self.clock.now_ns(), self.power.mean_power_w(self.cycle.timing))
 
 
-def rate_fields(icd: InterfaceDefinition) -> list[tuple[Field, int, float]]:
+def rate_fields(icd: InterfaceDefinition) -> tuple[tuple[Field, int, float], ...]:
     """Return the integer fields that report a body rate, whose range it may exceed: field, axis, factor."""
     axes = {"rate.x": 0, "rate.y": 1, "rate.z": 2}
-    return [
+    return tuple(
         (field, axes[str(field.value)], factor("rad/s", field.unit) or 1.0)
         for row in icd.telemetry.values()
         for field in row.named_fields.values()
         if field.value in axes and field.kind == "integer"
-    ]
+    )
 
 
 def adopt_camera(parameters: Parameters, profile: Profile, constants: Mapping[str, Value]) -> None:

@@ -5,72 +5,24 @@ Stored images are files, of which the oldest gives way to a new one. A download 
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Final
-
-import numpy as np
+from dataclasses import replace
+from typing import Any, Final
 
 from starhil.emulator.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.device.signals import Signals
-from starhil.emulator.pipeline.binning import mean_over_squares
+from starhil.emulator.device.stored_images import ImageState, StoredImage
 from starhil.emulator.pipeline.imager import Imager, PipelineReply
 from starhil.emulator.pipeline.messages import IMAGE_EDGES, ImageRequest, ImageResult
-from starhil.protocol.image_transfer import FRAME_SIZE, file_checksum
 
 STORE_S: Final = 0.1
 """Modelled time to store an image, seconds."""
 
 MAX_FILES: Final = 16
 """Number of images that are kept."""
-
-PALETTE: Final = b"".join(bytes((n, n, n, 0)) for n in range(256))
-BMP_HEAD: Final = struct.Struct("<2sIHHIIiiHHIIiiII")
-
-
-@dataclass(frozen=True)
-class StoredImage:
-    """A square 8-bit image, which is also a file."""
-
-    edge: int
-    pixels: bytes
-    """Edge in pixels, and the pixels row by row from the top."""
-    frame: int
-    number: int
-    """Number of the image since start-up, from 1 to 255 and again from 1; the counter of its file."""
-    unix_ns: int = 0
-    """Time on the device's clock when it was stored."""
-
-    def binned(self, edge: int) -> StoredImage:
-        """Return the image reduced to `edge` by averaging squares of pixels."""
-        if edge == self.edge:
-            return self
-        image = np.frombuffer(self.pixels, dtype=np.uint8).reshape(self.edge, self.edge)
-        small = mean_over_squares(image, self.edge // edge)
-        return StoredImage(edge, small.tobytes(), self.frame, self.number, self.unix_ns)
-
-    @property
-    def file_size(self) -> int:
-        """Size of the file, bytes."""
-        return BMP_HEAD.size + len(PALETTE) + len(self.pixels)
-
-    @cached_property
-    def file_crc(self) -> int:
-        """Checksum of the file."""
-        return file_checksum(self.bmp())
-
-    def bmp(self) -> bytes:
-        """Return the image as a grey BMP file."""
-        offset = BMP_HEAD.size + len(PALETTE)
-        planes, bits, compression, per_metre, colours = 1, 8, 0, 2835, 256
-        layout = (planes, bits, compression, len(self.pixels), per_metre, per_metre, colours, 0)
-        head = BMP_HEAD.pack(b"BM", self.file_size, 0, 0, offset, 40, self.edge, -self.edge, *layout)
-        return head + PALETTE + self.pixels
 
 
 class ImageStore:
@@ -94,35 +46,41 @@ class ImageStore:
         self._count = 0
         self._at_exposure: Callable[[], None] | None = None
         """Called once, when the next exposure has been sent to the pipeline."""
-        self.files: dict[int, StoredImage] = {}
-        """The stored images by number, oldest first."""
-        self.percent = 0
-        self.status = "ok"
-        self.busy = False
-        self.download: StoredImage | None = None
-        self.frame = 0
+        self.state = ImageState()
+        """The present state; each change makes a new one."""
 
-    @property
-    def stored(self) -> StoredImage | None:
-        """The newest stored image, or None."""
-        return next(reversed(self.files.values()), None)
+    def _change(self, **changes: Any) -> None:
+        self.state = replace(self.state, **changes)
+
+    def load_chunk(self, number: int) -> None:
+        """Load a chunk of the open image."""
+        self._change(chunk_number=number)
+
+    def erase(self, number: int) -> bool:
+        """Erase a stored image; return False if it does not exist."""
+        kept = tuple(image for image in self.state.files if image.number != number)
+        existed = len(kept) < len(self.state.files)
+        self._change(files=kept)
+        return existed
+
+    def erase_all(self) -> None:
+        """Erase all stored images."""
+        self._change(files=())
 
     def save(self, edge: int) -> None:
         """Capture and store the next exposure; in standby, take one."""
-        self.percent = 0
-        self.status = "waiting_sensor"
+        self._change(percent=0, status="waiting_sensor")
 
         def fetch() -> None:
-            self.percent, self.status = 50, "waiting_frame"
+            self._change(percent=50, status="waiting_frame")
             self._fetch_image(edge, store)
 
         def store(answer: ImageResult | None) -> None:
-            self.busy = False
             if answer is None:
-                self.percent, self.status = 0, "storage_error"
+                self._change(busy=False, percent=0, status="storage_error")
                 return
             self._store(answer)
-            self.percent, self.status = 100, "ok"
+            self._change(busy=False, percent=100, status="ok")
 
         self._capture(fetch)
 
@@ -131,7 +89,7 @@ class ImageStore:
         captured = PendingAnswer[ImageResult | None]()
 
         def finish(answer: ImageResult | None) -> None:
-            self.busy = False
+            self._change(busy=False)
             captured.end(answer)
 
         self._capture(lambda: self._fetch_image(0, finish))
@@ -139,7 +97,7 @@ class ImageStore:
 
     def _capture(self, then: Callable[[], None]) -> None:
         """Call `then` when the next exposure has been sent to the pipeline; in standby, take one."""
-        self.busy = True
+        self._change(busy=True)
         if self._cycle.running:
             self._at_exposure = then
             return
@@ -169,33 +127,26 @@ class ImageStore:
     def _store(self, answer: ImageResult) -> None:
         """Store an image as the newest file; the oldest one is deleted if there are too many."""
         number = self._count = self._count % 255 + 1
-        self.files.pop(number, None)
-        self.files[number] = StoredImage(
-            answer.width, answer.pixels, answer.frame, number, self._time.unix_ns()
-        )
-        if len(self.files) > MAX_FILES:
-            del self.files[next(iter(self.files))]
+        self.erase(number)
+        stored = StoredImage(answer.width, answer.pixels, answer.frame, number, self._time.unix_ns())
+        self._change(files=(*self.state.files, stored)[-MAX_FILES:])
 
     def open_stored(self, edge: int) -> bool:
         """Open the stored image for download, reduced to `edge`; return False if it is too small."""
-        if self.stored is None or edge > self.stored.edge:
+        stored = self.state.stored
+        if stored is None or edge > stored.edge:
             return False
-        self.download = self.stored.binned(edge)
-        self.frame = 0
+        self._change(download=stored.binned(edge), chunk_number=0)
         return True
 
     def open_last(self, edge: int) -> PendingAnswer[bool]:
         """Open the last exposure for download; the result is whether there was one."""
         opened = PendingAnswer[bool]()
-        self.busy = True
-        self.download = None
+        self._change(busy=True, download=None)
 
         def take(answer: ImageResult | None) -> None:
-            self.busy = False
-            self.frame = 0
-            self.download = (
-                None if answer is None else StoredImage(answer.width, answer.pixels, answer.frame, 0)
-            )
+            image = None if answer is None else StoredImage(answer.width, answer.pixels, answer.frame, 0)
+            self._change(busy=False, download=image, chunk_number=0)
             opened.end(answer is not None)
 
         self._fetch_image(edge, take)
@@ -213,18 +164,6 @@ class ImageStore:
         self._imager.submit(ImageRequest(edge), answered.end)
         due_ns = self._now_ns() + round(STORE_S * NANOSECONDS)
         self._scheduler.at(due_ns, lambda _due_ns: answered.when_done(finish))
-
-    @property
-    def frames(self) -> int:
-        """Number of image frames of the open download; 0 if none is open."""
-        return 0 if self.download is None else len(self.download.pixels) // FRAME_SIZE
-
-    def frame_bytes(self) -> bytes:
-        """Return the loaded image frame of the open download."""
-        if self.download is None:
-            return bytes(FRAME_SIZE)
-        start = self.frame * FRAME_SIZE
-        return self.download.pixels[start : start + FRAME_SIZE]
 
 
 def edge_of(size_name: str) -> int:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.pipeline.messages import ZERO, FrameResult, Triple
 from starhil.emulator.truth.source import TruthState
+from starhil.protocol.conventions import NANOSECONDS
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,11 @@ class Measurement:
     published_ns: int
     """Simulation time of publication, nanoseconds."""
     mode: Mode
+    """Mode of the device at the exposure."""
     truth: TruthState
+    """Truth of the sensor at mid-exposure."""
     result: FrameResult
+    """Result of the pipeline."""
     valid: bool
     reason: str
     """Validity after the checks of the device, and the reason if not valid."""
@@ -36,6 +39,7 @@ class Measurement:
     identify_s: float = 0.0
     """Modelled times of the steps, seconds."""
     period_s: float = 0.0
+    """Time between frames, seconds."""
     late: bool = False
     """Whether the machine took longer than the modelled time."""
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Final
 
 from starhil.emulator.device.navigation import perigee_below_surface
@@ -79,6 +81,32 @@ def _contradiction(values: Mapping[str, ParameterValue]) -> tuple[tuple[str, ...
     return None
 
 
+@dataclass(frozen=True, eq=False)
+class ParameterState(Mapping[str, ParameterValue]):
+    """The values of all parameters at one moment, by name."""
+
+    current: Mapping[str, ParameterValue]
+    """The values."""
+    defaults: Mapping[str, ParameterValue]
+    """The defaults for this device."""
+    stored: Mapping[str, ParameterValue]
+    """The stored values."""
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        return self.current[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.current)
+
+    def __len__(self) -> int:
+        return len(self.current)
+
+    @property
+    def differs_from_store(self) -> bool:
+        """Whether a restart would change any value."""
+        return {**self.defaults, **self.stored} != self.current
+
+
 class Parameters(Mapping[str, ParameterValue]):
     """All parameters, each always within its limits.
 
@@ -93,41 +121,35 @@ class Parameters(Mapping[str, ParameterValue]):
         on_change: Callable[[frozenset[str]], None] = lambda _names: None,
     ) -> None:
         self._definitions = icd.device_parameters
-        self._defaults: dict[str, ParameterValue] = {
-            name: p.default for name, p in icd.device_parameters.items()
-        }
-        self._stored: dict[str, ParameterValue] = {}
+        standard: dict[str, ParameterValue] = {name: p.default for name, p in icd.device_parameters.items()}
         self._on_change = on_change
         try:
-            self._defaults.update(self._checked(self._defaults, defaults or {}))
+            own = MappingProxyType(standard | self._checked(standard, defaults or {}))
         except MessageError as error:
             raise EmulatorError(f"parameters.{error}") from None
-        self._values = dict(self._defaults)
+        self.state = ParameterState(own, own, MappingProxyType({}))
+        """The present values; each change makes a new state."""
 
     def __getitem__(self, name: str) -> ParameterValue:
-        return self._values[name]
+        return self.state.current[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._values)
+        return iter(self.state.current)
 
     def __len__(self) -> int:
-        return len(self._values)
+        return len(self.state.current)
 
     def number(self, name: str) -> float:
         """Return a parameter as the number that is sent on the bus."""
-        return self._definitions[name].to_number(self._values[name])
+        return self._definitions[name].to_number(self[name])
 
     def definition(self, name: str) -> Parameter:
         """Return type, unit, limits and description of a parameter."""
         return self._definitions[name]
 
-    def default(self, name: str) -> ParameterValue:
-        """Return the default of a parameter for this device."""
-        return self._defaults[name]
-
     def set(self, changes: Mapping[str, Value]) -> None:
         """Set parameters, all or none; MessageError if a value is outside its limits, or two values contradict each other."""
-        self._assign(self._checked(self._values, changes))
+        self._assign(self._checked(self, changes))
 
     def flip_bit(self, name: str, bit: int) -> bool:
         """Flip a bit of a parameter in memory, as a particle does; return whether the result is valid.
@@ -139,21 +161,20 @@ class Parameters(Mapping[str, ParameterValue]):
         try:
             self.set({name: flipped})
         except MessageError:
-            self._assign({name: self._defaults[name]})
+            self._assign({name: self.state.defaults[name]})
             return False
         return True
 
     def set_defaults(self) -> None:
         """Set all parameters to their defaults."""
-        self._assign(self._defaults)
+        self._assign(self.state.defaults)
 
     def adopt_defaults(self, defaults: Mapping[str, Value]) -> None:
         """Replace some defaults, and values that are still at their default."""
-        checked = self._checked(self._defaults, defaults)
-        follow = {
-            name: value for name, value in checked.items() if self._values[name] == self._defaults[name]
-        }
-        self._defaults.update(checked)
+        before = self.state.defaults
+        checked = self._checked(before, defaults)
+        follow = {name: value for name, value in checked.items() if self[name] == before[name]}
+        self.state = replace(self.state, defaults=MappingProxyType({**before, **checked}))
         self._assign(follow)
 
     def restore(self, stored: Mapping[str, object]) -> list[str]:
@@ -162,6 +183,7 @@ class Parameters(Mapping[str, ParameterValue]):
         Unknown parameters and invalid values are ignored. Contradictions are checked for all stored values
         together, and the change is reported once.
         """
+        defaults = self.state.defaults
         allowed: dict[str, Value] = {}
         for name, value in stored.items():
             if name in self._definitions and isinstance(value, (bool, int, float, str)):
@@ -169,23 +191,18 @@ class Parameters(Mapping[str, ParameterValue]):
                     allowed[name] = self._definitions[name].check(value)
         accepted: dict[str, ParameterValue] = {}
         try:
-            accepted = self._checked(self._defaults, allowed)
+            accepted = self._checked(defaults, allowed)
         except MessageError:  # if two values contradict each other, the later one is ignored
             for name, value in allowed.items():
                 with contextlib.suppress(MessageError):
-                    accepted |= self._checked({**self._defaults, **accepted}, {name: value})
-        self._stored = accepted
-        self._assign({**self._defaults, **accepted})
+                    accepted |= self._checked({**defaults, **accepted}, {name: value})
+        self.mark_stored(accepted)
+        self._assign({**defaults, **accepted})
         return [name for name in stored if name not in accepted]
 
     def mark_stored(self, stored: Mapping[str, ParameterValue]) -> None:
         """Record the stored values."""
-        self._stored = dict(stored)
-
-    @property
-    def differ_from_store(self) -> bool:
-        """Return whether a restart would change any value."""
-        return {**self._defaults, **self._stored} != self._values
+        self.state = replace(self.state, stored=MappingProxyType(dict(stored)))
 
     def _checked(
         self, base: Mapping[str, ParameterValue], changes: Mapping[str, Value]
@@ -200,7 +217,7 @@ class Parameters(Mapping[str, ParameterValue]):
         return checked
 
     def _assign(self, values: Mapping[str, ParameterValue]) -> None:
-        changed = frozenset(name for name, value in values.items() if self._values[name] != value)
-        self._values.update(values)
+        changed = frozenset(name for name, value in values.items() if self[name] != value)
         if changed:
+            self.state = replace(self.state, current=MappingProxyType({**self.state.current, **values}))
             self._on_change(changed)

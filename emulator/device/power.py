@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.profile_sections import PowerConfig, ThermalConfig
+from starhil.protocol.conventions import NANOSECONDS
 
 MILLI: Final = 1e-3
 
@@ -27,13 +27,16 @@ class FrameTiming:
     """Timing of the frames."""
 
     running: bool
+    """Whether the sensor is exposing."""
     start_ns: int
     """Start of the last exposure, simulation time."""
     busy_s: float
     """Time from the start of an exposure to the end of its processing, seconds."""
     period_s: float
+    """Time between frames, seconds."""
 
 
+@dataclass(frozen=True)
 class PowerModel:
     """Current and power of the unit in each phase.
 
@@ -42,9 +45,8 @@ class PowerModel:
     all phases, idle is shortened first, then the transfer.
     """
 
-    def __init__(self, config: PowerConfig) -> None:
-        self._config = config
-        self._current_ma: dict[Phase, float] = {phase: getattr(config, f"{phase}_ma") for phase in Phase}
+    config: PowerConfig
+    """Table `[power]` of the profile."""
 
     def durations_s(self, timing: FrameTiming) -> dict[Phase, float]:
         """Return the duration of each phase in a period, beginning with the exposure."""
@@ -54,8 +56,8 @@ class PowerModel:
         lasting = {}
         for phase, wanted in (
             (Phase.EXPOSURE, timing.busy_s),
-            (Phase.IMAGER_ON, self._config.imager_on_s),
-            (Phase.TRANSFER, self._config.transfer_s),
+            (Phase.IMAGER_ON, self.config.imager_on_s),
+            (Phase.TRANSFER, self.config.transfer_s),
             (Phase.IDLE, math.inf),
         ):
             lasting[phase] = min(wanted, left)
@@ -76,11 +78,12 @@ class PowerModel:
 
     def current_a(self, phase: Phase) -> float:
         """Return the current in a phase, amperes."""
-        return self._current_ma[phase] * MILLI
+        milliamperes: float = getattr(self.config, f"{phase}_ma")
+        return milliamperes * MILLI
 
     def power_w(self, phase: Phase) -> float:
         """Return the power in a phase, watts."""
-        return self.current_a(phase) * self._config.voltage_v
+        return self.current_a(phase) * self.config.voltage_v
 
     def mean_power_w(self, timing: FrameTiming) -> float:
         """Return the power averaged over a period, watts."""
@@ -89,41 +92,53 @@ class PowerModel:
         return energy / timing.period_s
 
 
-class ThermalModel:
-    """Temperature of the unit: the mounting's temperature, which follows the orbit, plus heating by power.
+@dataclass(frozen=True)
+class ThermalState:
+    """Temperature of the unit while its mean power does not change.
 
-    The heating follows the mean power with one time constant.
+    It is the temperature of the mounting, which follows the orbit, plus heating by power, which follows the mean power
+    with one time constant.
     """
 
-    def __init__(self, config: ThermalConfig) -> None:
-        self._config = config
-        self._rise_c = 0.0
-        self._towards_c = 0.0
-        self._since_ns = 0
+    config: ThermalConfig
+    """Table `[thermal]` of the profile."""
+    since_ns: int = 0
+    """Simulation time of the last change of the mean power."""
+    rise_c: float = 0.0
+    towards_c: float = 0.0
+    """Heating at that time, and that to which it tends, degrees."""
 
-    def start(self, now_ns: int, power_w: float) -> None:
-        """Start at the temperature of the mounting."""
-        self._rise_c = 0.0
-        self._since_ns = now_ns
-        self._towards_c = power_w * self._config.heating_c_w
-
-    def set_power(self, now_ns: int, power_w: float) -> None:
-        """Change the mean power."""
-        self._rise_c = self._temperature_rise(now_ns)
-        self._since_ns = now_ns
-        self._towards_c = power_w * self._config.heating_c_w
-
-    def _temperature_rise(self, now_ns: int) -> float:
-        elapsed_s = max(now_ns - self._since_ns, 0) / NANOSECONDS
-        left = math.exp(-elapsed_s / self._config.time_constant_s)
-        return self._towards_c + (self._rise_c - self._towards_c) * left
+    def heating_c(self, now_ns: int) -> float:
+        """Return the heating at a simulation time, degrees."""
+        elapsed_s = max(now_ns - self.since_ns, 0) / NANOSECONDS
+        left = math.exp(-elapsed_s / self.config.time_constant_s)
+        return self.towards_c + (self.rise_c - self.towards_c) * left
 
     def mounting_c(self, now_ns: int) -> float:
         """Return the temperature of the mounting, °C."""
-        config = self._config
+        config = self.config
         turn = 2.0 * math.pi * (now_ns / NANOSECONDS) / config.period_s
         return config.mounting_c + config.swing_c * math.sin(turn)
 
     def temperature_c(self, now_ns: int) -> float:
         """Return the temperature of detector and lens, °C."""
-        return self.mounting_c(now_ns) + self._temperature_rise(now_ns)
+        return self.mounting_c(now_ns) + self.heating_c(now_ns)
+
+
+class ThermalModel:
+    """The thermal state, which a change of the mean power replaces."""
+
+    def __init__(self, config: ThermalConfig) -> None:
+        self.state = ThermalState(config)
+
+    def start(self, now_ns: int, power_w: float) -> None:
+        """Start at the temperature of the mounting."""
+        self._change(now_ns, 0.0, power_w)
+
+    def set_power(self, now_ns: int, power_w: float) -> None:
+        """Change the mean power."""
+        self._change(now_ns, self.state.heating_c(now_ns), power_w)
+
+    def _change(self, now_ns: int, rise_c: float, power_w: float) -> None:
+        config = self.state.config
+        self.state = ThermalState(config, now_ns, rise_c, power_w * config.heating_c_w)

@@ -15,16 +15,21 @@ from typing import Any, Final, TypeAlias, TypeVar
 
 import numpy as np
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.refusal import Refused
-from starhil.emulator.device.reported import SEQUENCES, to_reported_frame
+from starhil.emulator.device.reported import SEQUENCES
 from starhil.emulator.device.snapshot import Snapshot
+from starhil.emulator.device.stored_images import BMP_TYPE, StoredImage, msdos_time
 from starhil.emulator.pipeline.messages import MatchedStar, Triple, as_triple
-from starhil.protocol.conventions import DAY_NS
+from starhil.protocol.conventions import DAY_NS, NANOSECONDS
 from starhil.protocol.device_model import HEALTH, PARAMETER, generic, number_in
 from starhil.protocol.icd_schema import QuantityModel
-from starhil.protocol.image_transfer import frame_checksum
+from starhil.protocol.image_transfer import (
+    burst_packet,
+    file_checksum,
+    frame_checksum,
+    parse_burst_packet,
+)
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Parameter, Value
 
@@ -53,10 +58,10 @@ def getter_of(name: str) -> Getter:
     """Return the function of a quantity such as `attitude.w`, `stars[3].x` or `parameter.exposure`."""
     if name.startswith(PARAMETER):
         parameter = name.removeprefix(PARAMETER)
-        return lambda shot: shot.device.parameters[parameter]
+        return lambda shot: shot.parameters[parameter]
     if name.startswith(HEALTH):
         key = name.removeprefix(HEALTH)
-        return lambda shot: shot.device.profile.health.get(key)
+        return lambda shot: shot.constants.health.get(key)
     function, number = QUANTITIES[generic(name)].function, number_in(name)
     return function if number is None else lambda shot: function(shot, number)
 
@@ -144,22 +149,30 @@ def _star_direction(name: str, doc: str, function: Callable[[Snapshot, MatchedSt
 
 def _flag(name: str, doc: str) -> None:
     """Declare a flag of the links."""
-    _quantity(f"link.{name}", bool, "", doc, lambda shot: name in shot.device.counters.flags)
+    _quantity(f"link.{name}", bool, "", doc, lambda shot: name in shot.counters.flags)
 
 
 def _identity(name: str, doc: str) -> None:
     """Declare a number that identifies the device."""
-    _quantity(f"identity.{name}", int, "", doc, lambda shot: int(getattr(shot.device.profile.device, name)))
+    _quantity(f"identity.{name}", int, "", doc, lambda shot: int(getattr(shot.constants.identity, name)))
 
 
 def _selected(name: str, doc: str, function: Callable[[Snapshot, Parameter], float]) -> None:
     """Declare a quantity of the selected parameter, which has no value if no parameter has the ID."""
 
     def of_selected(shot: Snapshot) -> float | None:
-        chosen = shot.device.icd.parameters_by_id.get(shot.device.selected_parameter)
-        return None if chosen is None else function(shot, chosen)
+        return None if shot.selected is None else function(shot, shot.selected)
 
     _quantity(f"selected.{name}", float, "", doc, of_selected)
+
+
+def _file(name: str, unit: str, doc: str, function: Callable[[StoredImage], int]) -> None:
+    """Declare a number of the current file of the list, which is 0 if there is none."""
+
+    def of_file(shot: Snapshot) -> int:
+        return 0 if shot.file is None else function(shot.file)
+
+    _quantity(f"file.{name}", int, unit, doc, of_file)
 
 
 # fmt: off
@@ -173,7 +186,7 @@ _quantity("attitude.w", float, "",
 _quantity("attitude.valid", bool, "", "Whether the attitude of the last frame is valid.",
           lambda shot: bool(shot.frame is not None and shot.frame.valid))
 _quantity("attitude.stable", int, "", "Valid attitudes in a row, up to the last frame; 0 if it is invalid.",
-          lambda shot: shot.device.valid_in_a_row)
+          lambda shot: shot.valid_in_a_row)
 _named("attitude.reason", "attitude_reason", "Why the attitude is invalid, `ok` if it is valid.",
        lambda shot: str(shot.reported.reason))
 _solution("attitude.sigma_cross", "arcsec", "One sigma about an axis across the boresight, with known errors of the calibration, "
@@ -211,7 +224,7 @@ _vector("rate.", "rad/s",
 _frame("rate.valid", bool, "", "Whether the body rate is valid.", lambda frame: frame.rate_valid)
 _quantity("rate.clipped", bool, "", "Whether a rate is beyond the range of a field that reports it.",
           lambda shot: shot.frame is not None and any(
-              field.clips(shot.reported.rate_rad_s[axis] * factor) for field, axis, factor in shot.device.rate_fields))
+              field.clips(shot.reported.rate_rad_s[axis] * factor) for field, axis, factor in shot.constants.rate_fields))
 
 # --- the last frame ---
 
@@ -227,16 +240,16 @@ _quantity("frame.time_nanoseconds", int, "ns", "Middle of the exposure on the de
 _frame("frame.time_of_day", float, "s", "Middle of the exposure on the device's clock, since midnight UTC.",
        lambda frame: frame.mid_unix_ns % DAY_NS / NANOSECONDS)
 _quantity("frame.period", float, "s", "Time between frames.",
-          lambda shot: 1.0 / float(shot.device.parameters["update_rate"]) if shot.frame is None else shot.frame.period_s)
+          lambda shot: 1.0 / float(shot.parameters["update_rate"]) if shot.frame is None else shot.frame.period_s)
 _frame("frame.latency", float, "s", "Time from the middle of the exposure to the result.",
        lambda frame: float(frame.latency_s))
 _quantity("frame.age", float, "s", "Time since the middle of the exposure.",
-          lambda shot: None if shot.frame is None else (shot.device.clock.now_ns() - shot.frame.mid_ns) / NANOSECONDS)
+          lambda shot: None if shot.frame is None else (shot.now_ns - shot.frame.mid_ns) / NANOSECONDS)
 _frame("frame.capture", float, "s", "Duration of exposure and read-out.", lambda frame: float(frame.capture_s))
 _frame("frame.detect", float, "s", "Duration of the detection.", lambda frame: float(frame.detect_s))
 _frame("frame.identify", float, "s", "Duration of the identification.", lambda frame: float(frame.identify_s))
 _named("frame.mode", "mode", "Mode of the device at the exposure; without a frame, the current mode.",
-       lambda shot: (shot.device.modes.mode if shot.frame is None else shot.frame.mode).value)
+       lambda shot: (shot.mode if shot.frame is None else shot.frame.mode).value)
 _named("frame.method", "identification_mode", "How the identification was attempted, also if it failed.",
        lambda shot: None if shot.frame is None else "tracking" if shot.frame.result.tracked else "lost_in_space")
 _frame("frame.tracking", bool, "", "Whether identification was by tracking, also if it failed.",
@@ -264,13 +277,13 @@ _star("hip", int, "", "Hipparcos number of the nth brightest identified star; 0 
 _star("x", float, "px", "Column of the nth star.", lambda _shot, star: star.x)
 _star("y", float, "px", "Row of the nth star.", lambda _shot, star: star.y)
 _star("centred_x", float, "px", "Column of the nth star from the image centre, (width - 1) / 2.",
-      lambda shot, star: star.x - (shot.device.profile.camera.width - 1) / 2.0)
+      lambda shot, star: star.x - (shot.constants.image_size[0] - 1) / 2.0)
 _star("centred_y", float, "px", "Row of the nth star from the image centre, (height - 1) / 2.",
-      lambda shot, star: star.y - (shot.device.profile.camera.height - 1) / 2.0)
+      lambda shot, star: star.y - (shot.constants.image_size[1] - 1) / 2.0)
 _star("magnitude", float, "mag", "Measured magnitude of the nth star.", lambda _shot, star: star.magnitude)
 _star("confidence", float, "%", "Confidence in the nth star.", lambda shot, _star: _confidence(shot))
 _star_direction("vector_", "Measured direction of the nth star, {} in the reported frame.",
-                lambda shot, star: as_triple(to_reported_frame(shot.device, np.array(star.vector))))
+                lambda shot, star: as_triple(shot.reported.in_reported_frame(np.array(star.vector))))
 _star_direction("icrs_", "Modelled direction of the nth star, {} in ICRS: that of the catalogue at its epoch, without aberration.",
                 lambda _shot, star: star.icrs)
 
@@ -293,7 +306,7 @@ _quantity("clock.day_milliseconds", int, "ms", "The device's clock, whole millis
 _quantity("clock.submilliseconds", int, "us", "The device's clock, fraction of the millisecond.",
           lambda shot: shot.clock_ns % 1_000_000 // 1_000)
 _quantity("clock.set", bool, "", "Whether the clock has been set since start-up.",
-          lambda shot: shot.device.time.was_set)
+          lambda shot: shot.clock_set)
 _quantity("uptime", float, "s", "Time since start-up.", lambda shot: shot.uptime_ns / NANOSECONDS)
 _quantity("uptime.seconds", int, "s", "Time since start-up, whole seconds.",
           lambda shot: shot.uptime_ns // NANOSECONDS)
@@ -302,29 +315,29 @@ _quantity("uptime.milliseconds", int, "ms", "Time since start-up, fraction of th
 
 # --- state ---
 
-_named("mode", "mode", "Mode of the device.", lambda shot: shot.device.modes.mode.value)
-_quantity("mode.changes", int, "", "Mode changes since start-up.", lambda shot: shot.device.mode_changes)
-_named("error", "device_error", "Why the mode is `error`.", lambda shot: shot.device.modes.error or "none")
-_quantity("error.active", bool, "", "Whether the mode is `error`.", lambda shot: bool(shot.device.modes.error))
-_named("boot.reset_cause", "reset_cause", "Why the device restarted.", lambda shot: shot.device.reset_cause)
+_named("mode", "mode", "Mode of the device.", lambda shot: shot.mode.value)
+_quantity("mode.changes", int, "", "Mode changes since start-up.", lambda shot: shot.mode_changes)
+_named("error", "device_error", "Why the mode is `error`.", lambda shot: shot.error or "none")
+_quantity("error.active", bool, "", "Whether the mode is `error`.", lambda shot: bool(shot.error))
+_named("boot.reset_cause", "reset_cause", "Why the device restarted.", lambda shot: shot.reset_cause)
 _named("boot.cause", "boot_cause", "What started the running program.",
-       lambda shot: "power" if shot.device.reset_cause == "power_on" else "command")
-_quantity("boot.count", int, "", "Starts since the parameter store was created.", lambda shot: shot.device.boot_count)
+       lambda shot: "power" if shot.reset_cause == "power_on" else "command")
+_quantity("boot.count", int, "", "Starts since the parameter store was created.", lambda shot: shot.boot_count)
 _quantity("boot.program", int, "", "Number of the running program.", lambda _shot: 1)
 _identity("node_type", "Kind of node, from the profile.")
 _identity("interface_version", "Version of the interface definition, from the profile.")
 _identity("firmware_major", "Firmware version, major, from the profile.")
 _identity("firmware_minor", "Firmware version, minor, from the profile.")
-_quantity("counters.telecommands", int, "", "Telecommands received.", lambda shot: shot.device.counters.telecommands)
-_quantity("counters.telemetry", int, "", "Telemetry requests received.", lambda shot: shot.device.counters.telemetry)
+_quantity("counters.telecommands", int, "", "Telecommands received.", lambda shot: shot.counters.telecommands)
+_quantity("counters.telemetry", int, "", "Telemetry requests received.", lambda shot: shot.counters.telemetry)
 _quantity("counters.requests", int, "", "Telecommands and telemetry requests received.",
-          lambda shot: shot.device.counters.telecommands + shot.device.counters.telemetry)
-_quantity("counters.frames", int, "", "Frames since start-up.", lambda shot: shot.device.cycle.published)
+          lambda shot: shot.counters.telecommands + shot.counters.telemetry)
+_quantity("counters.frames", int, "", "Frames since start-up.", lambda shot: shot.frames)
 _quantity("counters.frames_valid", int, "", "Frames with a valid attitude since start-up.",
-          lambda shot: shot.device.frames_valid)
+          lambda shot: shot.frames_valid)
 
 _quantity("link.error", bool, "", "Whether any flag of the links is set.",
-          lambda shot: bool(shot.device.counters.flags))
+          lambda shot: bool(shot.counters.flags))
 _flag("telecommand_overrun", "A telecommand arrived before the previous one was finished.")
 _flag("uart_protocol_error", "Bytes that violate the serial framing.")
 _flag("uart_incomplete", "A serial message was not completed.")
@@ -332,92 +345,89 @@ _flag("uart_check_error", "A serial message had a wrong checksum.")
 _flag("uart_address_error", "A serial message was for another address.")
 _flag("can_telecommand_error", "Bad segment order, length or type of CAN frames.")
 _quantity("link.faults", int, "", "Invalid inputs of all kinds.",
-          lambda shot: sum(shot.device.counters.faults.values()))
+          lambda shot: sum(shot.counters.faults.values()))
 _quantity("request.last", int, "", "ID of the last telecommand.",
-          lambda shot: shot.device.acknowledge.last_telecommand)
+          lambda shot: shot.acknowledge.last_telecommand)
 _quantity("request.processed", bool, "", "Whether the last telecommand has been processed.",
-          lambda shot: shot.device.acknowledge.processed)
+          lambda shot: shot.acknowledge.processed)
 _named("request.error", "error_code", "Result of the last telecommand.",
-       lambda shot: shot.device.acknowledge.error.name.lower())
+       lambda shot: shot.acknowledge.error.name.lower())
 _quantity("request.index", int, "",
           "Index of the field because of which the telecommand was refused with invalid_parameter.",
-          lambda shot: shot.device.acknowledge.parameter_index)
+          lambda shot: shot.acknowledge.parameter_index)
 
 # --- parameters ---
 
 _quantity("parameters.changed", bool, "", "Whether a parameter differs from its stored value.",
-          lambda shot: shot.device.parameters.differ_from_store)
+          lambda shot: shot.parameters.differs_from_store)
 _quantity("parameters.store_fault", bool, "", "Whether the stored parameters were damaged at start-up.",
-          lambda shot: shot.device.store.corrupt)
-_quantity("selected.id", int, "", "ID of the selected parameter.", lambda shot: shot.device.selected_parameter)
+          lambda shot: shot.store_fault)
+_quantity("selected.id", int, "", "ID of the selected parameter.", lambda shot: shot.selected_id)
 _selected("value", "Value of the selected parameter.",
-          lambda shot, chosen: shot.device.parameters.number(chosen.name))
+          lambda shot, chosen: chosen.to_number(shot.parameters[chosen.name]))
 _selected("minimum", "Minimum of the selected parameter.", lambda _shot, chosen: float(chosen.minimum))
 _selected("maximum", "Maximum of the selected parameter.", lambda _shot, chosen: float(chosen.maximum))
 _selected("default", "Default of the selected parameter.",
-          lambda shot, chosen: float(chosen.to_number(shot.device.parameters.default(chosen.name))))
+          lambda shot, chosen: float(chosen.to_number(shot.parameters.defaults[chosen.name])))
 
 # --- images and files ---
 
 
 def _image_chunk(shot: Snapshot) -> bytes:
-    if shot.device.images.busy and shot.device.images.download is None:
+    if shot.images.busy and shot.images.download is None:
         raise Refused(ErrorCode.BUSY)
-    return shot.device.images.frame_bytes()
+    return shot.images.chunk
 
 
 _quantity("image.stored", bool, "", "Whether an image is stored for download.",
-          lambda shot: shot.device.images.stored is not None)
-_quantity("image.percent", int, "%", "Progress of save_image.", lambda shot: shot.device.images.percent)
-_named("image.status", "image_status", "State of save_image.", lambda shot: shot.device.images.status)
+          lambda shot: shot.images.stored is not None)
+_quantity("image.percent", int, "%", "Progress of save_image.", lambda shot: shot.images.percent)
+_named("image.status", "image_status", "State of save_image.", lambda shot: shot.images.status)
 _quantity("image.chunk", bytes, "",
           "The loaded chunk, 128 bytes, of the opened image; refused while an image is being opened.", _image_chunk)
-_quantity("image.chunk_number", int, "", "Number of the loaded chunk.", lambda shot: shot.device.images.frame)
+_quantity("image.chunk_number", int, "", "Number of the loaded chunk.", lambda shot: shot.images.chunk_number)
 _quantity("image.chunk_checksum", int, "", "Sum of the loaded chunk's bytes modulo 256.",
-          lambda shot: frame_checksum(shot.device.images.frame_bytes()))
-_quantity("file.ready", bool, "", "Whether a block of a file is loaded.", lambda shot: shot.device.files.ready)
+          lambda shot: frame_checksum(shot.images.chunk))
+_quantity("file.ready", bool, "", "Whether a block of a file is loaded.", lambda shot: bool(shot.files.block))
 _quantity("file.parameter_error", bool, "", "Whether the requested file or range does not exist.",
-          lambda shot: shot.device.files.parameter_error)
-_quantity("file.checksum", int, "", "CRC-16/XMODEM of the loaded block.", lambda shot: shot.device.files.checksum)
-_quantity("file.length", int, "B", "Bytes in the loaded block.", lambda shot: len(shot.device.files.data))
+          lambda shot: shot.files.parameter_error)
+_quantity("file.checksum", int, "", "CRC-16/XMODEM of the loaded block.", lambda shot: file_checksum(shot.files.block))
+_quantity("file.length", int, "B", "Bytes in the loaded block.", lambda shot: len(shot.files.block))
 _quantity("file.packet_number", int, "", "Number of the current packet of the last burst.",
-          lambda shot: shot.device.files.packet[0])
+          lambda shot: shot.files.packets[0])
 _quantity("file.packet", bytes, "", "The current packet of the last burst, 20 bytes.",
-          lambda shot: shot.device.files.packet[1])
-_quantity("file.type", int, "", "Type of the current file of the list: 4 for an image, 0 at the end of the list.",
-          lambda shot: int(shot.device.files.info.type))
+          lambda shot: parse_burst_packet(burst_packet(shot.files.block, shot.files.packets[0]))[1])
+_file("type", "", "Type of the current file of the list: 4 for an image, 0 at the end of the list.",
+      lambda _image: BMP_TYPE)
 _quantity("file.updating", bool, "",
           "Whether the current file of the list is still being looked up; its other quantities are 0 until then.",
-          lambda shot: shot.device.files.updating)
-_quantity("file.counter", int, "", "Number of the current file of the list.",
-          lambda shot: int(shot.device.files.info.counter))
-_quantity("file.size", int, "B", "Size of the current file of the list.",
-          lambda shot: int(shot.device.files.info.size))
-_quantity("file.time", int, "", "Date and time of the current file of the list, in MS-DOS format.",
-          lambda shot: int(shot.device.files.info.time))
-_quantity("file.crc", int, "", "CRC-16/XMODEM of the current file of the list.",
-          lambda shot: shot.device.files.info.checksum)
+          lambda shot: shot.file_updating)
+_file("counter", "", "Number of the current file of the list.", lambda image: image.number)
+_file("size", "B", "Size of the current file of the list.", lambda image: image.file_size)
+_file("time", "", "Date and time of the current file of the list, in MS-DOS format.",
+      lambda image: msdos_time(image.unix_ns))
+_file("crc", "", "CRC-16/XMODEM of the current file of the list.", lambda image: image.file_crc)
 _quantity("card.formatting", bool, "", "Whether format_card is erasing all files.",
-          lambda shot: shot.device.files.erasing and shot.device.files.formatting)
+          lambda shot: shot.erasing and shot.files.formatting)
 _quantity("card.erasing", bool, "", "Whether erase_file is erasing all files.",
-          lambda shot: shot.device.files.erasing and not shot.device.files.formatting)
+          lambda shot: shot.erasing and not shot.files.formatting)
 _declare("file.hole_map[n]", bytes, "The nth eighth of the map of packets that have arrived.",
-         lambda shot, number: shot.device.files.arrived.part(number), count=8)
+         lambda shot, number: shot.files.arrived.part(number), count=8)
 
 # --- health ---
 
 _named("power.phase", "phase", "Phase of the frame cycle.", lambda shot: shot.phase.value)
 _quantity("power.voltage", float, "V", "Supply voltage, `power.voltage_v` of the profile.",
-          lambda shot: shot.device.profile.power.voltage_v)
+          lambda shot: shot.constants.power.config.voltage_v)
 _quantity("power.current", float, "A", "Current in this phase.",
-          lambda shot: shot.device.power.current_a(shot.phase))
-_quantity("power.now", float, "W", "Power in this phase.", lambda shot: shot.device.power.power_w(shot.phase))
+          lambda shot: shot.constants.power.current_a(shot.phase))
+_quantity("power.now", float, "W", "Power in this phase.", lambda shot: shot.constants.power.power_w(shot.phase))
 _quantity("power.mean", float, "W", "Power averaged over a frame period.",
-          lambda shot: shot.device.power.mean_power_w(shot.device.cycle.timing))
+          lambda shot: shot.constants.power.mean_power_w(shot.timing))
 _quantity("temperature.mounting", float, "degC", "Temperature of the mounting.",
-          lambda shot: shot.device.thermal.mounting_c(shot.device.clock.now_ns()))
+          lambda shot: shot.thermal.mounting_c(shot.now_ns))
 _quantity("temperature.detector", float, "degC", "Temperature of the detector and the lens.",
-          lambda shot: shot.device.thermal.temperature_c(shot.device.clock.now_ns()))
+          lambda shot: shot.thermal.temperature_c(shot.now_ns))
 _frame("sky.sun_in_field", bool, "",
        "The Sun is in the field of view of the last frame or within its exclusion angle.",
        lambda frame: "sun" in frame.result.in_field)

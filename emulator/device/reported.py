@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, reduce
 from itertools import product
@@ -10,10 +11,12 @@ from typing import Final
 
 import numpy as np
 
-from starhil.emulator.device.device import Device
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode
-from starhil.emulator.device.parameters import Parameters
+from starhil.emulator.device.parameters import ParameterValue
 from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple, as_quaternion, as_triple
+from starhil.protocol.conventions import Conventions
+from starid.arrays import Array
 from starid.attitude import Attitude
 
 _IDENTITY: Final = Attitude.identity()
@@ -39,6 +42,12 @@ class Reported:
     """ICRS → reported frame; the identity if invalid."""
     mounted: Attitude = _IDENTITY
     """ICRS → sensor frame after the mounting angles; the reported frame differs from it in the names of its axes."""
+    turns: tuple[Array, ...] = ()
+    """Rotation vectors (3,) that turn the sensor frame to the reported frame, one after another, radians."""
+
+    def in_reported_frame(self, vector: Array) -> Array:
+        """Turn a vector (3,) from the sensor frame to the reported frame."""
+        return _turned(vector, self.turns)
 
     @property
     def valid(self) -> bool:
@@ -91,59 +100,58 @@ def _half_turn(angle: float) -> float:
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
-def reported(device: Device) -> Reported:
-    """Return the currently reported attitude, in the conventions of the unit."""
-    last = device.fresh
-    if last is None:
-        running = device.modes.mode.makes_frames
-        failed = device.modes.mode is Mode.ERROR
-        return Reported("processing_error" if failed else "no_frame" if running else "not_running")
-    if not last.valid:
-        return Reported(last.reason)
-    measured = Attitude(np.array(last.result.quaternion_xyzw))
-    mounting, axes = mounting_turns(device.parameters), axes_turns(device.icd.conventions.rows)
+def reported(
+    frame: Measurement | None,
+    mode: Mode,
+    parameters: Mapping[str, ParameterValue],
+    conventions: Conventions,
+    last: Quaternion,
+) -> Reported:
+    """Return the attitude of a frame, in the conventions of the unit.
+
+    `last` is the last valid quaternion before it, for the sign of this one.
+    """
+    if frame is None:
+        no_frame = "no_frame" if mode.makes_frames else "not_running"
+        return Reported("processing_error" if mode is Mode.ERROR else no_frame)
+    if not frame.valid:
+        return Reported(frame.reason)
+    measured = Attitude(np.array(frame.result.quaternion_xyzw))
+    mounting, axes = mounting_turns(parameters), axes_turns(conventions.rows)
     mounted = reduce(Attitude.rotated, mounting, measured)
     attitude = reduce(Attitude.rotated, axes, mounted)
-    rate = as_triple(_turned(np.array(last.rate_rad_s), mounting + axes))
-    return Reported("ok", _in_convention(attitude, device), rate, attitude, mounted)
+    turns = mounting + axes
+    rate = as_triple(_turned(np.array(frame.rate_rad_s), turns))
+    return Reported("ok", _in_convention(attitude, conventions, last), rate, attitude, mounted, turns)
 
 
-def to_reported_frame(device: Device, vector: np.ndarray) -> np.ndarray:
-    """Turn a vector (3,) from the sensor frame to the reported frame."""
-    return _turned(vector, mounting_turns(device.parameters) + axes_turns(device.icd.conventions.rows))
-
-
-def _turned(vector: np.ndarray, turns: list[np.ndarray]) -> np.ndarray:
+def _turned(vector: Array, turns: Sequence[Array]) -> Array:
     """Return a vector (3,) in a frame that has been turned by rotation vectors, one after another."""
     for turn in turns:
         vector = Attitude.identity().rotated(turn).to_sensor(vector)
     return vector
 
 
-def _in_convention(attitude: Attitude, device: Device) -> Quaternion:
+def _in_convention(attitude: Attitude, conventions: Conventions, last: Quaternion) -> Quaternion:
     """Return a quaternion with the direction and sign of the unit's convention."""
-    conventions = device.icd.conventions
     x, y, z, w = as_quaternion(attitude)
     if conventions.quaternion == "attitude":
         x, y, z = -x, -y, -z
-    if conventions.scalar_sign == "any":
-        before = device.reported_quaternion
-        if x * before[0] + y * before[1] + z * before[2] + w * before[3] < 0.0:
-            x, y, z, w = -x, -y, -z, -w
-        device.reported_quaternion = (x, y, z, w)
+    if conventions.scalar_sign == "any" and x * last[0] + y * last[1] + z * last[2] + w * last[3] < 0.0:
+        x, y, z, w = -x, -y, -z, -w
     return x, y, z, w
 
 
 @cache
-def axes_turns(rows: tuple[tuple[int, int, int], ...]) -> list[np.ndarray]:
+def axes_turns(rows: tuple[tuple[int, int, int], ...]) -> tuple[Array, ...]:
     """Return the rotation vector from sensor axes to reported axes, radians, for the rows of `Conventions.rows`."""
     matrix = np.array(rows, dtype=np.float64)
     *axis, w = Attitude.from_matrix(matrix.T).quaternion_xyzw.tolist()
     sine = float(np.linalg.norm(axis))
-    return [np.array(axis) / sine * 2.0 * math.atan2(sine, w)] if sine > 0.0 else []
+    return (_read_only(np.array(axis) / sine * 2.0 * math.atan2(sine, w)),) if sine > 0.0 else ()
 
 
-def mounting_turns(parameters: Parameters) -> list[np.ndarray]:
+def mounting_turns(parameters: Mapping[str, ParameterValue]) -> tuple[Array, ...]:
     """Return the rotation vectors from sensor frame to reported frame, radians; zero angles are omitted.
 
     The reported frame is the sensor frame turned by alpha about x, then by beta about the new y, then by
@@ -155,5 +163,10 @@ def mounting_turns(parameters: Parameters) -> list[np.ndarray]:
         if angle != 0.0:
             turn = np.zeros(3)
             turn[axis] = angle
-            turns.append(turn)
-    return turns
+            turns.append(_read_only(turn))
+    return tuple(turns)
+
+
+def _read_only(vector: Array) -> Array:
+    vector.flags.writeable = False
+    return vector

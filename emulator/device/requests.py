@@ -12,6 +12,7 @@ from starhil.emulator.device.counters import Acknowledge
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
+from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.guard import log_internal_error
 from starhil.protocol.codec import Row
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
@@ -45,7 +46,7 @@ class Requests:
             item.role in ("ticks", "time") for item in serial.reply_header
         )
         """Whether replies contain the time."""
-        device.signals.row_due.connect(self._send_unsolicited)
+        device.signals.rows_due.connect(self._send_unsolicited)
 
     def handle(self, request: Request, *, console: bool = False) -> Answer:
         """Handle a request from a link; return the replies to send on the same link, in order.
@@ -57,16 +58,19 @@ class Requests:
             return []
         if request.kind is RequestKind.TELEMETRY:
             row = self._telemetry_rows.get((request.klass, request.id))
-            device.counters.telemetry = (device.counters.telemetry + (not console)) & 0xFFFF
-            return self._replies(request, row, self._answer_telemetry(request, row))
+            if not console:
+                device.counters = device.counters.with_telemetry()
+            shot = device.snapshot()
+            return self._replies(request, row, self._answer_telemetry(request, row, shot), shot)
         row = self._telecommand_rows.get((request.klass, request.id))
-        device.counters.telecommands = (device.counters.telecommands + 1) & 0xFFFF
+        device.counters = device.counters.with_telecommand()
         outcome = self._execute(request, row)
         if isinstance(outcome, PendingAnswer):
-            return outcome.then(lambda code: self._replies(request, row, self._answer(request, code)))
+            return outcome.then(lambda code: self._acknowledge(request, row, code, device.snapshot()))
         code, replies = outcome
-        answered = self._answers_with_data(request, replies) or self._replies(
-            request, row, self._answer(request, code)
+        shot = device.snapshot()
+        answered = self._answers_with_data(request, replies, shot) or self._acknowledge(
+            request, row, code, shot
         )
         following = [replace(item, destination=request.source) for item in replies if item.id is not None]
         return answered + following
@@ -75,20 +79,27 @@ class Requests:
         """Count input on a link that was not a valid request."""
         if not self.device.unresponsive:
             log.debug("%s: %s", fault.kind.value, fault.detail)
-            self.device.counters.count_fault(fault)
+            self.device.counters = self.device.counters.with_fault(fault)
 
-    def telemetry(self, name: str) -> bytes:
-        """Return the current data of a telemetry row; raises Refused if it cannot be read now."""
+    def telemetry(self, name: str, shot: Snapshot) -> bytes:
+        """Return the data of a telemetry row at one moment; raises Refused if it cannot be read then."""
+        binding = self.telemetry_bindings[name]
         try:
-            return self.telemetry_bindings[name].encode(self.device)
+            data = binding.encode(shot)
+            binding.follow(self.device)
         except Refused:
             raise
         except Exception as error:
             log_internal_error(f"telemetry {name}", error)
             raise Refused(ErrorCode.INTERNAL) from error
+        return data
 
-    def _replies(self, request: Request, row: Row | None, reply: Reply) -> list[Reply]:
-        """Return the answers of a row in order, including its reply or refusal."""
+    def _acknowledge(self, request: Request, row: Row | None, code: ErrorCode, shot: Snapshot) -> list[Reply]:
+        """Return the answers to a telecommand that has been executed or refused."""
+        return self._replies(request, row, self._answer(request, shot, code), shot)
+
+    def _replies(self, request: Request, row: Row | None, reply: Reply, shot: Snapshot) -> list[Reply]:
+        """Return the answers of a row in order, including its reply or refusal, all of one moment."""
         if row is None or row.answers == ("reply",):
             return [reply]
         replies: list[Reply] = []
@@ -102,34 +113,39 @@ class Requests:
                 as_request = replace(
                     request, kind=RequestKind.TELEMETRY, id=other.id, klass=other.klass, data=b""
                 )
-                replies.append(self._answer_telemetry(as_request, other))
+                replies.append(self._answer_telemetry(as_request, other, shot))
         return [replace(item, final=item is replies[-1]) for item in replies]
 
-    def _answers_with_data(self, request: Request, replies: Sequence[Reply]) -> list[Reply]:
+    def _answers_with_data(self, request: Request, replies: Sequence[Reply], shot: Snapshot) -> list[Reply]:
         """Return answers with data made by an action of a plugin, which are marked by having no ID."""
         data = [reply.data for reply in replies if reply.id is None]
         return [
-            replace(self._reply(request, ReplyKind.ACK, item), final=number == len(data))
+            replace(self._reply(request, shot, ReplyKind.ACK, item), final=number == len(data))
             for number, item in enumerate(data, 1)
         ]
 
-    def _answer_telemetry(self, request: Request, row: Row | None) -> Reply:
+    def _answer_telemetry(self, request: Request, row: Row | None, shot: Snapshot) -> Reply:
         if row is None:
-            return self._answer(request, ErrorCode.INVALID_ID)
+            return self._answer(request, shot, ErrorCode.INVALID_ID)
         if request.data:
-            return self._answer(request, ErrorCode.INVALID_LENGTH)
+            return self._answer(request, shot, ErrorCode.INVALID_LENGTH)
         try:
-            data = self.telemetry(row.name)
+            data = self.telemetry(row.name, shot)
         except Refused as refused:
-            return self._answer(request, refused.code)
-        return self._reply(request, ReplyKind.TELEMETRY, data)
+            return self._answer(request, shot, refused.code)
+        return self._reply(request, shot, ReplyKind.TELEMETRY, data)
 
-    def _answer(self, request: Request, code: ErrorCode) -> Reply:
+    def _answer(self, request: Request, shot: Snapshot, code: ErrorCode) -> Reply:
         kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
-        return self._reply(request, kind, code=code)
+        return self._reply(request, shot, kind, code=code)
 
     def _reply(
-        self, request: Request, kind: ReplyKind, data: bytes = b"", code: ErrorCode = ErrorCode.OK
+        self,
+        request: Request,
+        shot: Snapshot,
+        kind: ReplyKind,
+        data: bytes = b"",
+        code: ErrorCode = ErrorCode.OK,
     ) -> Reply:
         reply = Reply(
             kind,
@@ -141,16 +157,11 @@ class Requests:
             sequence=request.sequence,
             flags=request.flags,
         )
-        return self._with_times(reply)
+        return self._with_times(reply, shot)
 
-    def _with_times(self, reply: Reply) -> Reply:
+    def _with_times(self, reply: Reply, shot: Snapshot) -> Reply:
         """Return a reply with uptime and device time since the unit's epoch, if replies of the unit carry them."""
-        if not self._stamped:
-            return reply
-        device = self.device
-        uptime_ns = device.clock.now_ns() - device.started_ns
-        time_ns = device.icd.conventions.reported_ns(device.time.unix_ns())
-        return replace(reply, uptime_ns=uptime_ns, time_ns=time_ns)
+        return replace(reply, uptime_ns=shot.uptime_ns, time_ns=shot.clock_ns) if self._stamped else reply
 
     def _execute(
         self, request: Request, row: Row | None
@@ -158,36 +169,47 @@ class Requests:
         """Execute a telecommand and record its outcome, at once or when it is done."""
         device = self.device
         if not device.acknowledge.processed:
-            device.counters.overrun()
-        acknowledge = device.acknowledge = Acknowledge(request.id, processed=False)
+            device.counters = device.counters.with_overrun()
+        begun = device.acknowledge = Acknowledge(request.id, processed=False)
+
+        def end(code: ErrorCode = ErrorCode.OK, index: int = 0) -> None:
+            if device.acknowledge is begun:  # no other telecommand and no restart has followed
+                device.acknowledge = Acknowledge(request.id, error=code, parameter_index=index)
+
         if row is None:
-            acknowledge.end(ErrorCode.INVALID_ID)
+            end(ErrorCode.INVALID_ID)
             return ErrorCode.INVALID_ID, []
         try:
             outcome = self.telecommand_bindings[row.name].execute(device, request.data)
         except (Refused, MessageError) as refused:
-            acknowledge.end(refused.code, refused.index)
+            end(refused.code, refused.index)
             return refused.code, []
         except Exception as error:  # noqa: BLE001 (the OBC always gets an answer)
             log_internal_error(f"telecommand {request.id}", error)
-            acknowledge.end(ErrorCode.INTERNAL)
+            end(ErrorCode.INTERNAL)
             return ErrorCode.INTERNAL, []
         if isinstance(outcome, PendingAnswer):
-            outcome.when_done(acknowledge.end)
+            codes: list[ErrorCode] = []
+            outcome.when_done(codes.append)
+            outcome.when_done(end)
             if outcome.accepted:
                 return ErrorCode.OK, []
-            return (acknowledge.error, []) if outcome.done else outcome
-        acknowledge.end()
+            return (codes[0], []) if codes else outcome
+        end()
         return ErrorCode.OK, outcome or []
 
-    def _send_unsolicited(self, row: Row) -> None:
+    def _send_unsolicited(self, rows: Sequence[Row]) -> None:
         device = self.device
-        if device.unresponsive:
-            return
-        try:
-            data = self.telemetry(row.name)
-        except Refused:  # the row cannot be read now, for example while an image is being opened
+        if device.unresponsive or not rows:
             return
         host = int(device.parameters["host_address"])
-        reply = Reply(ReplyKind.UNSOLICITED, row.id, data, destination=host, klass=row.klass)
-        device.signals.unsolicited.emit(self._with_times(reply))
+        shot = device.snapshot()
+        for row in rows:
+            try:
+                data = self.telemetry(row.name, shot)
+            except Refused:  # the row cannot be read now, for example while an image is being opened
+                continue
+            reply = Reply(ReplyKind.UNSOLICITED, row.id, data, destination=host, klass=row.klass)
+            device.signals.unsolicited.emit(self._with_times(reply, shot))
+            if row.action is not None:
+                shot = device.snapshot()  # after the action that follows the reading of the row

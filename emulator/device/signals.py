@@ -6,7 +6,7 @@
     modes ──mode_changed──► device, subscriptions, CANopen, head, console
     parameters ──parameters_changed──► device, subscriptions, links
     device ──started──► subscriptions, serial link          device ──restarted──► links, head, revival of the pipeline
-    subscriptions ──row_due──► requests    requests ──unsolicited──► links
+    subscriptions ──rows_due──► requests    requests ──unsolicited──► links
     faults ──faults_changed──► recording
 
 Two parts that do not depend on the device have signals elsewhere: `Scheduler.added` wakes a sleeping pump, and
@@ -18,6 +18,7 @@ first the device, so that every other part finds it up to date.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -42,8 +43,8 @@ class Signals:
     """The device was switched on or reset, and has set parameters and time; the cause."""
     restarted: Signal[str] = field(default_factory=lambda: Signal("reset"))
     """A reset is complete; the cause."""
-    row_due: Signal[Row] = field(default_factory=lambda: Signal("unsolicited row"))
-    """A telemetry row is due to be sent unsolicited."""
+    rows_due: Signal[Sequence[Row]] = field(default_factory=lambda: Signal("unsolicited rows"))
+    """Telemetry rows of one moment are due to be sent unsolicited, in this order."""
     faults_changed: Signal[dict[str, Any]] = field(default_factory=lambda: Signal("faults"))
     """Faults were injected, as requested, or all were ended: {}."""
     unsolicited: Signal[Reply] = field(default_factory=lambda: Signal("unsolicited telemetry"))

@@ -46,7 +46,7 @@ class Subscriptions:
         self._scheduler = scheduler
         self._parameters = parameters
         self._now_ns = now_ns
-        self._send = signals.row_due.emit
+        self._send = signals.rows_due.emit
         self._lists: dict[str, Sequence[Subscription]] = {}
         self._events: dict[tuple[str, int], Event] = {}
         self._valid = False
@@ -69,26 +69,26 @@ class Subscriptions:
         self._valid = False
         self.replace("definition", self._streamed)
         self._subscribe_by_parameters()
-        self._report("start")
+        self._send(self._reporting("start"))
 
-    def _report(self, event: str) -> None:
-        """Send the rows that report an event."""
-        for row, events in self._reports:
-            if event in events:
-                self._send(row)
+    def _reporting(self, event: str) -> list[Row]:
+        """Return the rows that report an event."""
+        return [row for row, events in self._reports if event in events]
 
     def _mode_changed(self, change: Transition) -> None:
+        due: list[Row] = []
         if change.before is not change.after:
-            self._report("mode")
+            due += self._reporting("mode")
         if change.after is Mode.ERROR:
-            self._report("error")
+            due += self._reporting("error")
         if not change.after.makes_frames:
-            self._set_valid(valid=False)
+            due += self._reporting_validity(valid=False)
+        self._send(due)
 
-    def _set_valid(self, *, valid: bool) -> None:
+    def _reporting_validity(self, *, valid: bool) -> list[Row]:
+        """Return the rows that report a change of the validity, if this is one."""
         changed, self._valid = valid is not self._valid, valid
-        if changed:
-            self._report("validity")
+        return self._reporting("validity") if changed else []
 
     def _subscribe_by_parameters(self) -> None:
         rate_hz = float(self._parameters["unsolicited_rate"])
@@ -106,12 +106,10 @@ class Subscriptions:
 
     def _frame_published(self, measurement: Measurement) -> None:
         """Send the rows that are due with each frame."""
-        self._report("frame")
-        self._set_valid(valid=measurement.valid)
-        for subscriptions in list(self._lists.values()):
-            for subscription in subscriptions:
-                if subscription.rate_hz is None:
-                    self._send(subscription.row)
+        due = self._reporting("frame") + self._reporting_validity(valid=measurement.valid)
+        for subscriptions in self._lists.values():
+            due += [subscription.row for subscription in subscriptions if subscription.rate_hz is None]
+        self._send(due)
 
     def _schedule(self, key: tuple[str, int], row: Row, rate_hz: float, due_ns: int) -> None:
         period_ns = max(1, round(min(NANOSECONDS / rate_hz, LONGEST_PERIOD_NS)))
@@ -119,6 +117,6 @@ class Subscriptions:
         def due(at_ns: int) -> None:
             missed = max(0, (self._now_ns() - at_ns) // period_ns)
             self._schedule(key, row, rate_hz, at_ns + (missed + 1) * period_ns)
-            self._send(row)
+            self._send([row])
 
         self._events[key] = self._scheduler.at(due_ns, due)

@@ -64,7 +64,7 @@ class Surroundings:
         particles_s = particle_rate(
             self._radiation.quiet_s, self._radiation.anomaly_s, position_m, truth.unix_s
         )
-        return Conditions(self._thermal.temperature_c(self._now_ns()), particles_s)
+        return Conditions(self._thermal.state.temperature_c(self._now_ns()), particles_s)
 
 
 def orbit_of(profile: Profile) -> Orbit | None:

@@ -15,6 +15,7 @@ from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.requests import Requests
+from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import BusLink
 from starhil.emulator.links.bus_address import BusAddress
@@ -70,6 +71,26 @@ def not_before(deadline: float) -> int:
     return -(-numerator * NANOSECONDS // denominator)
 
 
+class DeviceSample:
+    """The device at one moment, `starhil.protocol.canopen.application.Sample`."""
+
+    def __init__(self, requests: Requests, shot: Snapshot) -> None:
+        self._requests = requests
+        self._shot = shot
+
+    def telemetry(self, row: Row) -> bytes:
+        """Return the bytes of a telemetry row."""
+        try:
+            return self._requests.telemetry(row.name, self._shot)
+        except Refused as refused:
+            check_status(refused.code, row.name)
+            raise
+
+    def parameter(self, name: str) -> Value:
+        """Return the value of a parameter in its unit."""
+        return self._shot.parameters[name]
+
+
 class DeviceApplication:
     """The application of the object dictionary, `starhil.protocol.canopen.application.Application`."""
 
@@ -83,13 +104,9 @@ class DeviceApplication:
         """Discard the captured image, because the device has restarted."""
         self._last_image = None
 
-    def telemetry(self, row: Row) -> bytes:
-        """Return the current bytes of a telemetry row."""
-        try:
-            return self._requests.telemetry(row.name)
-        except Refused as refused:
-            check_status(refused.code, row.name)
-            raise
+    def sample(self) -> DeviceSample:
+        """Return the device at this moment."""
+        return DeviceSample(self._requests, self._device.snapshot())
 
     def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
         """Execute a telecommand, which is counted and acknowledged as on the other links."""
@@ -110,10 +127,6 @@ class DeviceApplication:
             raise abort
         return None
 
-    def parameter(self, name: str) -> Value:
-        """Return the value of a parameter in its unit."""
-        return self._device.parameters[name]
-
     def set_parameter(self, name: str, value: Value) -> None:
         """Set a parameter; a value that contradicts another parameter is refused."""
         try:
@@ -124,7 +137,7 @@ class DeviceApplication:
     def image(self, name: str) -> GreyImage:
         """Return the image that `take_image` captured, or the one that save_image stored."""
         if name == "stored":
-            stored = self._device.images.stored
+            stored = self._device.images.state.stored
             if stored is not None:
                 return GreyImage(stored.edge, stored.edge, stored.frame, stored.pixels)
         elif self._last_image is not None:
@@ -133,7 +146,7 @@ class DeviceApplication:
 
     def take_image(self, name: str) -> Deferred:
         """Capture a full image; the write is answered when it is complete."""
-        if self._device.images.busy:
+        if self._device.images.state.busy:
             raise SdoAbortError(AbortCode.DEVICE_STATE, f"{name}: another image is being captured")
 
         def captured(image: ImageResult | None) -> SdoAbortError | None:
@@ -305,21 +318,14 @@ class CanopenLink(BusLink[CanFrame]):
         self._notify_rows(rows)
 
     def _mode_changed(self, transition: Transition) -> None:
+        errors = self._device.icd.enum("device_error")
         if transition.after is Mode.ERROR:
-            # The cause of the error is set only after the mode has changed.
-            self._device.scheduler.at(self._device.clock.now_ns(), self._device_failed)
-            return
-        if transition.before is Mode.ERROR:
-            for number in self._device.icd.enum("device_error").names:
+            code = DEVICE_ERROR + errors.values.get(self._device.modes.error, 0)
+            self._run_action(partial(self.slave.raise_emergency, code, ErrorRegister.MANUFACTURER))
+        elif transition.before is Mode.ERROR:
+            for number in errors.names:
                 self._run_action(partial(self.slave.clear_emergency, DEVICE_ERROR + number))
         self._notify_rows(self._status_rows)
-
-    def _device_failed(self, _due_ns: int) -> None:
-        numbers = self._device.icd.enum("device_error").values
-        code = DEVICE_ERROR + numbers.get(self._device.modes.error, 0)
-        if self._device.modes.mode is Mode.ERROR:
-            self._run_action(partial(self.slave.raise_emergency, code, ErrorRegister.MANUFACTURER))
-            self._notify_rows(self._status_rows)
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "canopen_node" in names and self._wanted_node != self.slave.node_id:

@@ -179,11 +179,14 @@ class MatchedStar:
     """An identified star."""
 
     hip: int
+    """Hipparcos number."""
     x: float
     y: float
     """Position, pixels."""
     magnitude: float
+    """Measured magnitude."""
     snr: float
+    """Signal-to-noise ratio."""
     vector: Triple
     """Measured direction in the sensor frame, by the camera of the profile."""
     icrs: Triple
@@ -195,6 +198,7 @@ class FrameResult:
     """Result of a frame request."""
 
     index: int
+    """Number of the frame since the start of the run."""
     valid: bool = False
     reason: str = "no_frame"
     """Whether the attitude is valid, and the reason if not, as named in the interface definition."""
@@ -224,11 +228,13 @@ class FrameResult:
     in_field: tuple[str, ...] = ()
     """Bodies in the field of view or within their exclusion angles: `sun`, `moon`, `earth`."""
     solved: bool = True
+    """Whether stars were to be detected and identified."""
     render_s: float = 0.0
     detect_s: float = 0.0
     identify_s: float = 0.0
     """Wall time of each step, for the log but not for telemetry."""
     preview: Preview | None = field(default=None, repr=False, compare=False)
+    """The image for display, if it was requested."""
 
 
 @dataclass(frozen=True)

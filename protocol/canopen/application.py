@@ -22,17 +22,24 @@ class GreyImage:
     pixels: bytes
 
 
-class Application(Protocol):
-    """The device behind an object dictionary; each method may raise `SdoAbortError` to refuse."""
+class Sample(Protocol):
+    """The device at one moment; each method may raise `SdoAbortError` to refuse."""
 
     def telemetry(self, row: Row) -> bytes:
-        """Return the current bytes of a telemetry row."""
-
-    def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
-        """Execute a telecommand whose payload has been checked against its row."""
+        """Return the bytes of a telemetry row."""
 
     def parameter(self, name: str) -> Value:
         """Return a parameter's value in its unit."""
+
+
+class Application(Protocol):
+    """The device behind an object dictionary; each method may raise `SdoAbortError` to refuse."""
+
+    def sample(self) -> Sample:
+        """Return the device at this moment, from which all entries of a PDO are read."""
+
+    def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
+        """Execute a telecommand whose payload has been checked against its row."""
 
     def set_parameter(self, name: str, value: Value) -> None:
         """Set a parameter; the value is within the limits of the interface definition."""

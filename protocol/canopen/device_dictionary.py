@@ -13,7 +13,7 @@ from typing import Final, NoReturn, cast
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.application import Application, abort_of
+from starhil.protocol.canopen.application import Application, Sample, abort_of
 from starhil.protocol.canopen.communication import (
     DATA_TYPES,
     MappedPdo,
@@ -59,8 +59,10 @@ class DeviceDictionary(Dictionary):
         """Entry by "INDEX.NAME" or "INDEX", in lower case."""
         self._holders: dict[tuple[str, str, int | None], Key] = {}
         """Kind, name and slot of a row → key of its entry; the slot is None for the whole row."""
-        self._cache: dict[str, bytes] = {}
-        self._cached_at = -1
+        self._sample: tuple[int, Sample] | None = None
+        """The last sample of the device, with the number of its instant."""
+        self._rows: dict[str, bytes] = {}
+        """Rows that have been read from it."""
         objects = ObjectDictionary()  # type: ignore[no-untyped-call]
         entries = [entry for placed in layout.object for entry in self._place(objects, placed)]
         rpdos = [self._mapped(model) for model in layout.rpdo]
@@ -75,14 +77,19 @@ class DeviceDictionary(Dictionary):
                     raise IcdError(f"canopen.toml: PDO {model.name}: {refusal}") from None
 
     def row_bytes(self, row: Row) -> bytes:
-        """Return the bytes of a telemetry row, read from the application once per sampling instant."""
-        if self._cached_at != self.instant:
-            self._cache.clear()
-            self._cached_at = self.instant
-        data = self._cache.get(row.name)
+        """Return the bytes of a telemetry row in this sampling instant."""
+        sample = self.sample()
+        data = self._rows.get(row.name)
         if data is None:
-            data = self._cache[row.name] = self.application.telemetry(row)
+            data = self._rows[row.name] = sample.telemetry(row)
         return data
+
+    def sample(self) -> Sample:
+        """Return the device in this sampling instant: it is sampled once."""
+        if self._sample is None or self._sample[0] != self.instant:
+            self._sample = self.instant, self.application.sample()
+            self._rows.clear()
+        return self._sample[1]
 
     def entries_of(self, row: Row) -> list[tuple[Key, Slot | None]]:
         """Return the entries that hold a row: one per slot, or one for the whole row, with None for its slot.
@@ -244,7 +251,7 @@ class DeviceDictionary(Dictionary):
         self.parameters[parameter.name] = key
 
         def read() -> bytes:
-            return encode(item, parameter.to_number(self.application.parameter(parameter.name)))
+            return encode(item, parameter.to_number(self.sample().parameter(parameter.name)))
 
         def write(data: bytes) -> None:
             try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+from starhil.emulator.device.snapshot import Snapshot
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from tests.conformance.mutant_seams import (
     Damage,
@@ -25,8 +26,8 @@ def boots_not_counted(unit: SimulatedUnit) -> None:
 def stale_attitude(unit: SimulatedUnit) -> None:
     original = unit.requests.telemetry
 
-    def changed(name: str) -> bytes:
-        data = bytearray(original(name))
+    def changed(name: str, shot: Snapshot) -> bytes:
+        data = bytearray(original(name, shot))
         if name == "precise_attitude":
             field = unit.device.icd.telemetry[name].named_fields["valid"]
             data[field.offset] |= 1 << field.shift
@@ -47,8 +48,8 @@ def _telemetry_bytes(name: str, field: str, change: Callable[[bytes], bytes]) ->
         original = unit.requests.telemetry
         item = unit.device.icd.telemetry[name].named_fields[field]
 
-        def changed(asked: str) -> bytes:
-            data = original(asked)
+        def changed(asked: str, shot: Snapshot) -> bytes:
+            data = original(asked, shot)
             if asked != name:
                 return data
             end = item.offset + item.size
@@ -144,7 +145,8 @@ enter(
     "both",
     "files.end",
     _of_files(
-        "advance", lambda files, _h: files._go_to((files._position + 1) % (len(files._images.files) + 1))
+        "advance",
+        lambda files, _h: files._go_to((files.state.position + 1) % (len(files._images.state.files) + 1)),
     ),
 )
 enter(

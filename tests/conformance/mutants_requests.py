@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 from starhil.emulator.device.device import Device
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request, RequestKind
@@ -13,6 +14,16 @@ from tests.conformance.mutant_seams import (
     handling,
     only_acknowledged,
 )
+
+
+def _counted(device: Device, **changes: Any) -> None:
+    """Change what the device has counted."""
+    device.counters = dataclasses.replace(device.counters, **changes)
+
+
+def _acknowledged(device: Device, **changes: Any) -> None:
+    """Change the outcome of the last telecommand."""
+    device.acknowledge = dataclasses.replace(device.acknowledge, **changes)
 
 
 def _recoded(old: ErrorCode, new: ErrorCode) -> Damage:
@@ -115,27 +126,19 @@ enter(
     "telecommands are counted twice",
     "both",
     "counters.telecommands",
-    handling(
-        lambda d, r, h: (setattr(d.counters, "telecommands", d.counters.telecommands + (r.id < 128)), h(r))[1]
-    ),
+    handling(lambda d, r, h: (_counted(d, telecommands=d.counters.telecommands + (r.id < 128)), h(r))[1]),
 )
 enter(
     "telemetry is not counted",
     "both",
     "counters.telemetry",
-    handling(
-        lambda d, r, h: (setattr(d.counters, "telemetry", d.counters.telemetry - (r.id >= 128)), h(r))[1]
-    ),
+    handling(lambda d, r, h: (_counted(d, telemetry=d.counters.telemetry - (r.id >= 128)), h(r))[1]),
 )
 enter(
     "telemetry counts as telecommands",
     "both",
     "counters.telemetry",
-    handling(
-        lambda d, r, h: (setattr(d.counters, "telecommands", d.counters.telecommands + (r.id >= 128)), h(r))[
-            1
-        ]
-    ),
+    handling(lambda d, r, h: (_counted(d, telecommands=d.counters.telecommands + (r.id >= 128)), h(r))[1]),
 )
 enter(
     "refused telecommands are not counted",
@@ -144,11 +147,7 @@ enter(
     handling(
         lambda d, r, h: [
             (
-                setattr(
-                    d.counters,
-                    "telecommands",
-                    d.counters.telecommands - (a.kind is ReplyKind.NACK and r.id < 128),
-                ),
+                _counted(d, telecommands=d.counters.telecommands - (a.kind is ReplyKind.NACK and r.id < 128)),
                 a,
             )[1]
             for a in h(r)
@@ -180,13 +179,13 @@ enter(
     "clear_counters leaves the flags",
     "serial",
     "errors.none",
-    _after("clear_counters", lambda d, _r: d.counters.flags.add("uart_protocol_error")),
+    _after("clear_counters", lambda d, _r: _counted(d, flags=d.counters.flags | {"uart_protocol_error"})),
 )
 enter(
     "clear_counters leaves the counts",
     "both",
     "counters.clear",
-    _after("clear_counters", lambda d, _r: setattr(d.counters, "telecommands", 7)),
+    _after("clear_counters", lambda d, _r: _counted(d, telecommands=7)),
 )
 enter(
     "the clock is set to whole seconds",
@@ -201,9 +200,7 @@ enter(
     handling(
         lambda d, r, h: (
             h(r),
-            setattr(
-                d.acknowledge, "error", ErrorCode.INVALID_PARAMETER if r.id == 103 else d.acknowledge.error
-            ),
+            _acknowledged(d, error=ErrorCode.INVALID_PARAMETER if r.id == 103 else d.acknowledge.error),
         )[0]
     ),
 )
@@ -211,25 +208,19 @@ enter(
     "the acknowledge names another telecommand",
     "both",
     "acknowledge.accepted",
-    handling(
-        lambda d, r, h: (h(r), setattr(d.acknowledge, "last_telecommand", 1) if r.id < 128 else None)[0]
-    ),
+    handling(lambda d, r, h: (h(r), _acknowledged(d, last_telecommand=1) if r.id < 128 else None)[0]),
 )
 enter(
     "the acknowledge is never processed",
     "both",
     "acknowledge.accepted",
-    handling(
-        lambda d, r, h: (h(r), setattr(d.acknowledge, "processed", r.id >= 128 and d.acknowledge.processed))[
-            0
-        ]
-    ),
+    handling(lambda d, r, h: (h(r), _acknowledged(d, processed=r.id >= 128 and d.acknowledge.processed))[0]),
 )
 enter(
     "the index of the refused field is missing",
     "both",
     "fields.set_unix_time.milliseconds.high",
-    handling(lambda d, r, h: (h(r), setattr(d.acknowledge, "parameter_index", 0))[0]),
+    handling(lambda d, r, h: (h(r), _acknowledged(d, parameter_index=0))[0]),
 )
 enter(
     "save_parameters stores nothing",

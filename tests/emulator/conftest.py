@@ -121,8 +121,9 @@ class Bench:
         store: StateStore | None = None,
         truth: TruthSource | None = None,
         unit: str = DEFAULT_UNIT,
+        clock: SteppedClock | None = None,
     ) -> None:
-        self.clock = SteppedClock()
+        self.clock = clock or SteppedClock()
         self.pipeline = FakePipeline()
         self.icd = load_unit(unit)
         self.store = store or MemoryStore()

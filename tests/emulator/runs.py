@@ -80,7 +80,9 @@ def command(emulation, name, **values) -> ErrorCode | None:
 
 def read(emulation, name) -> dict:
     """Read telemetry past the links, in physical units."""
-    return emulation.device.icd.telemetry[name].decode(emulation.requests.telemetry(name))
+    return emulation.device.icd.telemetry[name].decode(
+        emulation.requests.telemetry(name, emulation.device.snapshot())
+    )
 
 
 class Control:
@@ -112,9 +114,9 @@ async def every_row_read(emulation):
     """Wait until console or recording, whose requests are not counted, has read every telemetry row."""
     read, telemetry = set(), emulation.requests.telemetry
 
-    def note(name):
+    def note(name, shot):
         read.add(name)
-        return telemetry(name)
+        return telemetry(name, shot)
 
     emulation.requests.telemetry = note
     async with asyncio.timeout(20.0):

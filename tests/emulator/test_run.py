@@ -503,7 +503,7 @@ def test_a_save_that_fails_in_an_unforeseen_way_ends_the_acknowledge(run, monkey
         while not device.acknowledge.processed:
             await asyncio.sleep(0.01)
         assert device.acknowledge.error.name == "INTERNAL"
-        assert device.parameters.differ_from_store is False
+        assert device.parameters.state.differs_from_store is False
 
     run(scenario, clock="real", device={"boot_s": 0.1})
 

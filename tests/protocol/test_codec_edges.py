@@ -106,7 +106,7 @@ def test_an_enumeration_and_a_flag_limit_their_parameters():
 
 
 def test_the_first_and_the_last_packet_are_marked_and_none_beyond():
-    arrived = HoleMap([0, MAX_PACKETS - 1, MAX_PACKETS, -1])
+    arrived = HoleMap.of([0, MAX_PACKETS - 1, MAX_PACKETS, -1])
     assert 0 in arrived
     assert MAX_PACKETS - 1 in arrived
     assert MAX_PACKETS not in arrived
@@ -156,7 +156,7 @@ def test_a_number_beyond_single_precision_is_infinite(value, single):
         (lambda: encode_reply_frames(Reply(ReplyKind.ECHO, 1), 4), "CAN has no echo messages"),
         (lambda: encode_reply_frames(Reply(ReplyKind.TELEMETRY, None), 4), "a telemetry on CAN needs an ID"),
         (lambda: encode_reply_frames(Reply(ReplyKind.EVENT, 5, bytes(9)), 4), "of 9 bytes does not fit one CAN frame"),
-        (lambda: HoleMap().set_part(1, bytes(15)), f"hole map part of 15 bytes, must be {MAP_PART_SIZE}"),
+        (lambda: HoleMap().with_part(1, bytes(15)), f"hole map part of 15 bytes, must be {MAP_PART_SIZE}"),
         (lambda: HoleMap().part(0), "hole map part 0 is outside 1 to 8"),
         (lambda: parse_frame(b"frame 123 nan 00"), "malformed frame: frame 123 nan 00"),
         (lambda: parse_can_id(b"1234"), "CAN ID 1234 has neither"),

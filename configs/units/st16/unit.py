@@ -33,12 +33,11 @@ MAX_MESSAGE_SIZE = 256
 
 
 def reader(device: Any) -> Callable[..., float]:
-    """Return a function that reads quantities of the device by name, or a default if a quantity has no value."""
+    """Return a function that reads quantities of the device at this moment by name, or a default if one has no value."""
     # Imported here because reading the definition must not require the emulator.
     from starhil.emulator.device.quantities import getter_of
-    from starhil.emulator.device.snapshot import Snapshot
 
-    shot = Snapshot(device)
+    shot = device.snapshot()
 
     def value(name: str, default: float = 0.0) -> float:
         found = getter_of(name)(shot)

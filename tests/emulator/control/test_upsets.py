@@ -34,7 +34,7 @@ def test_single_precision_flips_as_in_memory(bench):
 
 @pytest.mark.parametrize(("name", "bit"), [("max_star_pixels", 1), ("update_rate", 30), ("focal_length", 31)])
 def test_a_flip_that_gives_an_invalid_setting_ends_in_the_error_mode_until_a_restart(bench, name, bit):
-    default = bench.device.parameters.default(name)
+    default = bench.device.parameters.state.defaults[name]
     if name == "max_star_pixels":
         bench.command("set_parameter", parameter=bench.icd.parameters[name].id, value=2)
         bit = 1

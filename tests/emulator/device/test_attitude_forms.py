@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from starhil.emulator.device.quantities import getter_of
 from starhil.emulator.device.reported import SEQUENCES, Reported
-from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.truth.source import FixedTruth
 from starid.attitude import Attitude, random_attitude
 
@@ -134,7 +133,7 @@ def test_the_mounting_angles_turn_right_ascension_declination_and_roll(make_benc
     bench.command("set_parameter", parameter=20, value=10.0)
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
-    shot = Snapshot(bench.device)
+    shot = bench.device.snapshot()
     mounted = Attitude(
         (rotation_of(ATTITUDE).inv() * Rotation.from_euler("x", 10.0, degrees=True)).inv().as_quat()
     )

@@ -6,7 +6,6 @@ import pytest
 
 from starhil.emulator.device.cycle import MAX_PENDING
 from starhil.emulator.device.quantities import getter_of
-from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.pipeline.messages import Failure
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth
@@ -165,9 +164,9 @@ def test_exposures_that_the_machine_has_no_time_for_are_skipped_and_tracking_con
 def test_the_age_of_a_frame_counts_from_the_middle_of_its_exposure(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
-    measured = Snapshot(bench.device).frame
-    age_s = (bench.clock.now_ns() - measured.mid_ns) / 1e9
-    assert getter_of("frame.age")(Snapshot(bench.device)) == age_s
+    shot = bench.device.snapshot()
+    age_s = (bench.clock.now_ns() - shot.frame.mid_ns) / 1e9
+    assert getter_of("frame.age")(shot) == age_s
     assert 0.0 < age_s < 2.5
 
 

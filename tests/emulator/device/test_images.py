@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from starhil.emulator.device.file_download import msdos_time
-from starhil.emulator.device.images import StoredImage
+from starhil.emulator.device.stored_images import StoredImage, msdos_time
 from starhil.emulator.pipeline.messages import Failure, ImageRequest, ImageResult
 from starhil.protocol.messages import ErrorCode, ReplyKind, Request
 
@@ -50,7 +49,7 @@ def test_capture_takes_the_next_frame_while_frames_run(bench):
     assert bench.read("image_status") == {"percent": 50, "status": "waiting_frame"}
     bench.step(0.1)
     assert bench.read("image_status") == {"percent": 100, "status": "ok"}
-    assert bench.device.images.stored.frame == bench.pipeline.frames[count].index
+    assert bench.device.images.state.stored.frame == bench.pipeline.frames[count].index
     assert all(request.solve for request in bench.pipeline.frames)
 
 
@@ -82,11 +81,11 @@ def test_the_image_is_kept_while_another_is_captured(bench):
     bench.command("init_image_download", image_size="size_64")
     bench.command("advance_image_download", next_frame=3)
     before = bench.read("image_frame")["data"]
-    first = bench.device.images.download
+    first = bench.device.images.state.download
     bench.command("save_image", image_size="size_128")
     bench.step(1.0)
-    assert bench.device.images.stored.edge == 128
-    assert bench.device.images.download is first
+    assert bench.device.images.state.stored.edge == 128
+    assert bench.device.images.state.download is first
     assert bench.read("image_frame")["data"] == before
 
 
@@ -99,7 +98,7 @@ def test_the_last_frame_can_be_downloaded_without_a_capture(bench):
     assert bench.requests.handle(Request.of(row.id))[0].code is ErrorCode.BUSY
     bench.step(0.2)
     assert bench.read("acknowledge")["processed"]
-    assert bench.device.images.download.frame == bench.pipeline.frames[-1].index
+    assert bench.device.images.state.download.frame == bench.pipeline.frames[-1].index
     assert len(bench.read("image_frame")["data"]) == 128
 
 
@@ -126,7 +125,7 @@ def test_a_new_frame_is_taken_beside_the_stored_image(bench):
     (frame,) = taken
     assert (frame.width, frame.height, len(frame.pixels)) == (10, 10, 100)
     assert frame.frame == bench.pipeline.frames[-1].index
-    assert bench.device.images.stored.edge == 64
+    assert bench.device.images.state.stored.edge == 64
     assert bench.command("save_image", image_size="size_64") is ErrorCode.OK
 
 
@@ -145,8 +144,8 @@ def test_a_capture_is_done_though_frames_stop_before_the_next_one(bench, stop):
     assert bench.read("image_status") == {"percent": 100, "status": "ok"}
     (frame,) = bench.pipeline.frames[count:]
     assert not frame.solve
-    assert bench.device.images.stored.frame == frame.index
-    assert not bench.device.images.busy
+    assert bench.device.images.state.stored.frame == frame.index
+    assert not bench.device.images.state.busy
 
 
 def test_a_whole_frame_is_taken_though_frames_stop(bench):
@@ -167,7 +166,7 @@ def test_a_capture_ends_when_the_pipeline_is_lost(bench):
     bench.device.pipeline_lost()
     bench.step(0.25)
     assert bench.read("image_status") == {"percent": 0, "status": "storage_error"}
-    assert not bench.device.images.busy
+    assert not bench.device.images.state.busy
 
 
 def test_a_capture_does_not_outlive_a_reset(bench):
@@ -178,18 +177,18 @@ def test_a_capture_does_not_outlive_a_reset(bench):
     bench.command("reset")
     bench.step(5.0)
     assert len(bench.pipeline.requests) == count
-    assert not bench.device.images.busy
+    assert not bench.device.images.state.busy
 
 
 def test_a_reset_forgets_images(bench):
     for number in (1, 2):
         save(bench)
-        assert bench.device.images.stored.number == number
+        assert bench.device.images.state.stored.number == number
     bench.command("reset")
     bench.step(1.0)
     assert not bench.read("device_status")["image_stored"]
     save(bench)
-    assert bench.device.images.stored.number == 1
+    assert bench.device.images.state.stored.number == 1
 
 
 # --- files in bursts ---
@@ -204,7 +203,7 @@ def load(bench, file_type, offset, length, counter=0):
 def test_the_image_comes_as_a_bmp_file_by_bursts_with_holes(bench):
     save(bench, "size_64")
     assert load(bench, "index", 0, 12) is ErrorCode.OK
-    index = bench.device.files.data
+    index = bench.device.files.state.block
     kind, number, edge, size, _frame = struct.unpack("<BBHII", index)
     assert (kind, edge) == (4, 64)
     file = b""
@@ -247,7 +246,7 @@ def test_files_that_are_not_there_are_refused(bench, file_type, offset, length):
     assert bench.read("file_block") == {"ready": False, "parameter_error": True, "checksum": 0, "length": 0}
     assert bench.command("start_burst") is ErrorCode.SEQUENCE
     bench.device.power_on()
-    assert not bench.device.files.parameter_error
+    assert not bench.device.files.state.parameter_error
 
 
 @pytest.mark.parametrize(
@@ -292,7 +291,7 @@ def test_the_file_list_has_size_checksum_and_time(bench):
     bench.command("reset_file_list")
     bench.step(0.03)
     info = bench.read("file_info")
-    file = bench.device.images.stored.bmp()
+    file = bench.device.images.state.stored.bmp()
     assert (info["type"], info["counter"], info["size"]) == (4, 1, len(file))
     assert info["crc"] == binascii.crc_hqx(file, 0)
     date = info["time"] >> 16
@@ -335,7 +334,7 @@ def test_packets_of_a_burst_are_read_one_by_one(bench):
     assert bench.read("file_packet")["number"] == 0
     bench.send("start_burst", ignore_hole_map=True)
     bench.read("file_block")
-    file = bench.device.images.stored.bmp()
+    file = bench.device.images.state.stored.bmp()
     for number in (0, 1, 2, 2):
         assert bench.read("file_packet") == {"number": number, "data": file[20 * number : 20 * number + 20]}
     bench.command("set_hole_map_1", map=bytes((0b101,)) + bytes(15))
@@ -366,7 +365,7 @@ def test_an_image_that_the_pipeline_delivers_late_is_stored_when_it_comes(bench,
     assert bench.read("image_status")["status"] != "ok"
     images(held)
     assert bench.read("image_status") == {"percent": 100, "status": "ok"}
-    assert bench.device.images.stored.frame == 7
+    assert bench.device.images.state.stored.frame == 7
 
 
 @pytest.mark.parametrize("wait_s", [0.05, 0.7, 5.0])
@@ -377,8 +376,8 @@ def test_a_reset_ends_a_capture_and_what_comes_of_it_later_is_dropped(bench, hel
     bench.step(5.0)
     images(held)
     bench.step(5.0)
-    assert bench.device.images.stored is None
-    assert not bench.device.images.busy
+    assert bench.device.images.state.stored is None
+    assert not bench.device.images.state.busy
 
 
 def test_no_chunk_is_loaded_while_the_image_is_being_opened(bench, held):

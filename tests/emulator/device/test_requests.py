@@ -3,6 +3,7 @@
 import pytest
 
 from starhil.emulator.device.actions import ACTIONS
+from starhil.emulator.device.counters import Counters
 from starhil.emulator.device.quantities import QUANTITIES
 from starhil.emulator.profile import Profile
 from starhil.protocol.icd import load_unit
@@ -85,7 +86,7 @@ def test_each_fault_of_a_link_counts_once(bench):
 
 
 def test_counters_wrap_at_16_bits(bench):
-    bench.device.counters.telecommands = 65535
+    bench.device.counters = Counters(telecommands=65535)
     bench.command("set_mode", mode="standby")
     assert bench.read("communication_status")["telecommand_count"] == 0
 
@@ -144,7 +145,7 @@ def test_a_telecommand_that_fails_unexpectedly_ends_with_an_error_code_and_is_lo
 def test_telemetry_that_fails_unexpectedly_is_answered_with_an_error_code_and_logged(
     bench, monkeypatch, caplog
 ):
-    monkeypatch.setattr(bench.requests.telemetry_bindings["rates"], "encode", lambda _device: 1 / 0)
+    monkeypatch.setattr(bench.requests.telemetry_bindings["rates"], "encode", lambda _shot: 1 / 0)
     (reply,) = bench.requests.handle(Request.of(bench.icd.telemetry["rates"].id))
     assert (reply.kind, reply.code) == (ReplyKind.NACK, ErrorCode.INTERNAL)
     assert "telemetry rates: internal error: ZeroDivisionError" in caplog.text

@@ -71,7 +71,7 @@ def test_the_reported_frame_has_the_axes_that_the_unit_names(unit, axes):
         assert mine == pytest.approx((-1.0 if axis[0] == "-" else 1.0) * rows[axis[1]], abs=1e-12)
     values = bench.read("attitude")
     camera = DEFAULT_CAMERA.back_project(
-        [[bench.device.fresh.result.stars[0].x, bench.device.fresh.result.stars[0].y]]
+        [[bench.device.snapshot().frame.result.stars[0].x, bench.device.snapshot().frame.result.stars[0].y]]
     )[0]
     for letter, axis in zip("xyz", axes, strict=True):
         assert values[f"v{letter}"] == pytest.approx(
@@ -95,6 +95,23 @@ def test_the_sign_of_the_scalar_stays_with_the_last_where_any_is_allowed(unit):
             first = now
             signs.add(np.sign(now[3]))
     assert signs == {-1.0, 1.0}
+
+
+def test_the_sign_of_the_scalar_does_not_depend_on_how_often_it_is_read(unit):
+    text = HEAD + '[conventions]\nscalar_sign = "any"\n' + row("telemetry", 1, "attitude", QUATERNION)
+    last = []
+    for reads_all in (True, False):
+        bench, turning = unit(text), Attitude(ATTITUDE.quaternion_xyzw)
+        bench.device.parameters.set({"max_rate": 30.0})
+        for _ in range(8):
+            turning = turning.rotated((np.radians(30.0), 0.0, 0.0))
+            bench.device.surroundings.truth = FixedTruth(turning)
+            bench.step(1.0)
+            if reads_all:
+                reported(bench)
+        last.append(reported(bench))
+    assert last[0][3] < 0.0
+    assert (last[0] == last[1]).all()
 
 
 @pytest.mark.parametrize(
@@ -139,7 +156,7 @@ def test_values_go_out_in_the_units_and_numbers_of_the_fields(unit):
     (reply,) = bench.requests.handle(bench.icd.request(bench.icd.telemetry["all"]))
     assert reply.data[:2] == b"\x04\xaa"
     values = bench.read("all")
-    assert values["latency"] == round(bench.device.fresh.latency_s * 1e6)
+    assert values["latency"] == round(bench.device.snapshot().frame.latency_s * 1e6)
     assert values["sigma"] == pytest.approx(np.radians(1.5 / 3600.0))
     assert (values["exposure"], values["temperature"], values["sync"]) == (100, 20.0, 0xEB90)
     assert [values[f"hip_{n}"] for n in range(1, 7)] == [32349, 101772, 27989, 21421, 0, 0]
@@ -232,7 +249,7 @@ def test_a_plugin_adds_quantities_and_actions(unit, tmp_path):
         "from starhil.protocol.plugin import action, quantity\n"
         '@quantity("twice.exposure", unit="s")\n'
         "def twice(snapshot):\n"
-        '    return 2e-3 * snapshot.device.parameters["exposure"]\n'
+        '    return 2e-3 * snapshot.parameters["exposure"]\n'
         '@action("double")\n'
         "def double(device, arguments):\n"
         '    device.parameters.set({"exposure": 2 * device.parameters["exposure"]})\n',

@@ -142,7 +142,7 @@ def test_rows_are_the_same_as_on_other_links(linked):
     def test(link):
         for name in ("identification", "precise_attitude", "star_config"):
             row = link.bench.icd.telemetry[name]
-            assert link.upload(0x2000, row.id) == link.bench.requests.telemetry(name)
+            assert link.upload(0x2000, row.id) == link.bench.requests.telemetry(name, link.device.snapshot())
 
     linked(test)
 
@@ -293,16 +293,17 @@ def test_image_that_was_stored(linked):
         assert link.sdo("2b 42 60 00 02 03") == "6042600000000000"  # star, 128 pixels
         link.step(2.0)
         assert link.upload(0x6043, 2) == (128).to_bytes(2, "little")
-        assert link.upload(0x6043, 1) == link.device.images.stored.pixels
+        assert link.upload(0x6043, 1) == link.device.images.state.stored.pixels
 
     linked(test)
 
 
 def test_error_mode_is_an_emergency(linked):
     def test(link):
+        link.take()
         link.device.modes.fail("sensor")
         number = link.bench.icd.enums["device_error"].values["sensor"]
-        assert [frame for frame in link.step(0.1) if frame[0] == 0x80 + NODE] == [
+        assert [frame for frame in link.take() if frame[0] == 0x80 + NODE] == [
             (0x80 + NODE, f"{number:02x}ff810000000000")
         ]
         link.bench.command("set_mode", mode="standby")

@@ -65,7 +65,7 @@ def test_raw_cubestar_has_stages_stars_and_time():
         assert len(data) == 28
         seconds, nanoseconds = struct.unpack_from("<II", data)
         assert seconds + nanoseconds / 1e9 == pytest.approx(
-            unit.bench.device.fresh.mid_unix_ns / 1e9, abs=1e-9
+            unit.bench.device.snapshot().frame.mid_unix_ns / 1e9, abs=1e-9
         )
         assert [bits(data, at, 4) for at in (64, 68, 72)] == [3, 4, 7]
         assert [bits(data, at, 1) for at in (76, 78, 79)] == [0, 1, 0]

@@ -119,7 +119,7 @@ def test_orientation_is_the_truth_and_known():
         assert arcseconds_between(rotation_matrix(i, j, k, real), true_matrix()) < 0.1
         assert upload(unit, 0x4002, 6) == b"\x01"
         midnight_ms = struct.unpack("<I", upload(unit, 0x4002, 4))[0]
-        assert midnight_ms == unit.bench.device.fresh.mid_unix_ns // 1_000_000 % 86_400_000
+        assert midnight_ms == unit.bench.device.snapshot().frame.mid_unix_ns // 1_000_000 % 86_400_000
 
     with_unit("oresat", "canopen", scenario)
 
@@ -144,7 +144,7 @@ def test_pdos_of_each_frame_have_the_published_can_ids_and_the_attitude():
         assert {0x3AC, 0x4AC, 0x1AD} <= set(frames)
         status, known, midnight_ms = struct.unpack("<BBI", frames[0x3AC])
         assert (status, known) == (STAR_TRACK, 1)
-        assert midnight_ms == unit.bench.device.fresh.mid_unix_ns // 1_000_000 % 86_400_000
+        assert midnight_ms == unit.bench.device.snapshot().frame.mid_unix_ns // 1_000_000 % 86_400_000
         real, i = struct.unpack("<2f", frames[0x4AC])
         j, k = struct.unpack("<2f", frames[0x1AD])
         assert arcseconds_between(rotation_matrix(i, j, k, real), true_matrix()) < 0.1

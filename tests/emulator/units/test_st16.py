@@ -77,7 +77,7 @@ def test_combination_has_the_true_attitude_sequence_rate_and_epoch():
         )
         assert struct.unpack_from("<3d", result, 0x28) == pytest.approx((0, 0, 0), abs=1e-9)
         assert struct.unpack_from("<d", result, 0x40)[0] == pytest.approx(
-            unit.bench.device.fresh.mid_unix_ns / 1e9, abs=1e-6
+            unit.bench.device.snapshot().frame.mid_unix_ns / 1e9, abs=1e-6
         )
 
     with_unit("st16", "serial", scenario)

@@ -16,6 +16,7 @@ import pytest
 
 from starhil.emulator.cli import endurance
 from starhil.emulator.cli.endurance import live, live_from_seed, read_life, run_once, write_life
+from starhil.emulator.device.actions import ACTIONS
 from starhil.emulator.device.counters import Counters
 from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.quantities import QUANTITIES
@@ -279,10 +280,10 @@ def test_a_life_in_a_file_is_repeated_as_it_was(tmp_path, monkeypatch):
 def forgetful(monkeypatch):
     """A unit that does not clear its counter of telemetry requests."""
 
-    def clear(self):
-        self.telecommands = 0
+    def clear(device, _arguments):
+        device.counters = Counters(telemetry=device.counters.telemetry)
 
-    monkeypatch.setattr(Counters, "clear", clear)
+    monkeypatch.setitem(ACTIONS, "clear_counters", clear)
 
 
 def violating(unit):

@@ -148,7 +148,7 @@ MUTANTS = (
     Mutant("inhibit time of a PDO in use changed", "tpdo", "pdo", "self._inhibit.writer = self._check_disabled", "pass"),
     Mutant("identifier of a PDO in use changed", "tpdo", "pdo_mapping", "        check_change(self._cob_id.number(), new, enabled=exists)\n", ""),
     Mutant("changed PDO keeps its old configuration", "tpdo", "slave", "            self.pdos.configure(changed)\n", ""),
-    Mutant("TPDOs of one SYNC from different samples", "design", "device_dictionary", "if self._cached_at != self.instant:", "if True:"),
+    Mutant("TPDOs of one SYNC from different samples", "design", "device_dictionary", "if self._sample is None or self._sample[0] != self.instant:", "if True:"),
     Mutant("RPDO acts in PRE-OPERATIONAL", "rpdo", "pdo", "        if self._context.state is not NmtState.OPERATIONAL:\n", "        if not self._context.communicates:\n"),
     Mutant("synchronous RPDO acts at once", "rpdo", "pdo", "            self._pending = data\n", "            self._apply(data)\n"),
     Mutant("short RPDO processed", "rpdo", "pdo", "        if len(data) < self._size:\n", "        data = data.ljust(self._size, b'\\0')\n        if not data:\n"),

@@ -38,6 +38,10 @@ class StandInApplication:
             for command in icd.telecommands
         }
 
+    def sample(self) -> StandInApplication:
+        """Return this application: it is of one moment."""
+        return self
+
     def telemetry(self, row: Row) -> bytes:
         """Return the preset values, encoded."""
         return row.encode(self.rows.get(row.name, {}))

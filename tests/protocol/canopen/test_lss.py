@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import random
 from unittest.mock import Mock
 
 import pytest
 
-from starhil.protocol.canopen.context import NmtState
+from starhil.protocol.canopen.context import UNCONFIGURED, NmtState
 from starhil.protocol.canopen.storage import ParameterStorage, StorageError
 
 VENDOR, PRODUCT, REVISION, SERIAL = 0, 0x53544152, 0x10000, 1
@@ -270,3 +271,49 @@ def test_extended_and_remote_frames_are_ignored(bench):
 def test_lss_works_in_every_state(bench, command):
     bench.nmt(command)
     assert select(bench) == ["4400000000000000"]
+
+
+LONGEST_SILENCE_S = 2 * 65.535
+"""Twice the longest delay of a change of the bit rate."""
+
+
+def answering(bench) -> list[int]:
+    """Return the node IDs under which an SDO client is answered."""
+    return [node for node in range(1, 128) if bench.frame(0x600 + node, "4000100000000000")]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_whatever_lss_frames_arrive_the_node_is_found_again(new_bench, seed):
+    rng, storage = random.Random(seed), ParameterStorage()
+    bench = new_bench(storage=storage).power_on()
+    commands = (0x04, 0x11, 0x13, 0x15, 0x17, 0x40, 0x41, 0x42, 0x43, 0x46, 0x4C, 0x51, 0x5E)
+    for _ in range(150):
+        values = (0, 1, 1, 0x21, UNCONFIGURED, rng.randrange(256))
+        lss(bench, bytes((rng.choice(commands), rng.choice(values))) + rng.randbytes(6))
+        if rng.random() < 0.03:
+            bench.nmt(rng.choice((129, 130)), 0)
+        bench.advance(rng.choice((0.0, 0.01, 0.5)))
+    if bench.slave.lss.silent:  # no node sends while the bit rate is changed
+        assert answering(bench) == []
+        bench.advance(LONGEST_SILENCE_S)
+    node = bench.slave.node_id
+    if node == UNCONFIGURED:
+        assert answering(bench) == []
+        for frame in ("04 01", "11 21", "04 00"):
+            lss(bench, frame)
+        node = 0x21
+    assert answering(bench) == [node]
+
+
+def test_a_stored_node_id_of_255_leaves_the_node_to_lss_after_a_restart(new_bench):
+    storage = ParameterStorage()
+    bench = new_bench(storage=storage).power_on()
+    for frame in ("04 01", "11 ff", "17"):
+        lss(bench, frame)
+    assert answering(bench) == [0x2C]
+    again = new_bench(storage=storage).power_on()
+    assert answering(again) == []
+    assert lss(again, "4c") == ["5000000000000000"]
+    for frame in ("04 01", "11 2c", "17", "04 00"):
+        lss(again, frame)
+    assert answering(again) == answering(new_bench(storage=storage).power_on()) == [0x2C]
