@@ -8,7 +8,6 @@ error names file, table and key, and what to write instead.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -31,7 +30,7 @@ from starhil.protocol.messages import ErrorCode, RequestKind
 from starhil.protocol.names import DEFAULT_UNIT, UNITS_FOLDER, did_you_mean, find_unit
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.user_file import read_user_text
+from starhil.protocol.user_file import TomlError, read_user_toml
 from starhil.protocol.validation_messages import Problem, problems
 from starhil.protocol.values import (
     FieldError,
@@ -143,12 +142,12 @@ class _Reader:
     def _read(self, file: Path) -> None:
         """Read and validate one file."""
         try:
-            document = tomllib.loads(read_user_text(file))
+            document = read_user_toml(file)
         except OSError as error:
             self.errors.append(f"{file}: cannot read the interface definition: {error.strerror}")
             self._unread = True
             return
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        except TomlError as error:
             self.errors.append(f"{file}: not valid TOML: {error}")
             self._unread = True
             return
