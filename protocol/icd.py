@@ -46,6 +46,7 @@ SETS: Final = "set_"
 """Prefix of the names of telecommands that can be read back."""
 HIGHEST_ID: Final = 0xFF
 """Highest ID if the link does not limit it."""
+MAX_ROWS: Final = 65536
 
 CLASS: Final = "class"
 """Table of the classes; among the broken names if a class is missing."""
@@ -115,6 +116,7 @@ class _Reader:
         self._removed: list[tuple[Path, RequestKind, Any]] = []
         """Rows that are not valid, with their files."""
         self._rows: dict[str, Row] = {}
+        self._expanded = 0
         self._ids: dict[tuple[int | None, int], str] = {}
         """Code of the class and ID → name of the row."""
         for file in files:
@@ -303,9 +305,7 @@ class _Reader:
         provenance = model.provenance or self._unit.provenance
         if provenance is None:
             raise IcdError("needs `provenance`, here or in [unit]")
-        last = model.id if model.last_id is None else model.last_id
-        if last < model.id:
-            raise IcdError(f"last_id {last} is below ID {model.id}")
+        ids = self._ids_of(model)
         if kind == "telecommand" and model.unsolicited is not None:
             raise IcdError("only telemetry is sent unsolicited")
         if kind == "telemetry" and model.readback is not None:
@@ -321,8 +321,12 @@ class _Reader:
             klass = ""
         elif answers is None:
             answers = self._classes[klass].answer
-        for number, row_id in enumerate(range(model.id, last + 1), 1):
-            single = model.last_id is None
+        single = model.last_id is None
+        errors = len(self.errors)
+        for number, row_id in enumerate(ids, 1):
+            if len(self.errors) > errors:  # the others would repeat it
+                self._broken |= {f"{model.name}_{rest}" for rest in range(number, len(ids) + 1)}
+                return
             layout = Layout(self._icd, kind, provenance, None if single else number)
             for name in model.include or ():
                 with Located("include"):
@@ -357,6 +361,16 @@ class _Reader:
                 request=model.request or "",
             )
             self._add_row(row, file, complete=model.name not in self._broken)
+
+    def _ids_of(self, model: schema.RowModel) -> range:
+        """Return the IDs of the rows to which an entry expands."""
+        ids = range(model.id, (model.id if model.last_id is None else model.last_id) + 1)
+        if not ids:
+            raise IcdError(f"last_id {model.last_id} is below ID {model.id}")
+        self._expanded += len(ids)
+        if self._expanded > MAX_ROWS:
+            raise IcdError(f"last_id {ids[-1]} makes {len(ids)} rows; a unit has at most {MAX_ROWS}")
+        return ids
 
     def _add_row(self, row: Row, file: Path, *, complete: bool) -> None:
         where = f"{file}: {row.kind} {row.name}"
