@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hmac
 import json
 import logging
 import secrets
@@ -18,7 +17,9 @@ from aiohttp.http import HttpProcessingError
 
 from starhil.emulator.console.console import Console
 from starhil.emulator.console.viewer import Viewer
+from starhil.emulator.control.token import is_token
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.json_lines import JsonError, parse_object
 from starhil.protocol.errors import reason
 from starhil.protocol.flow import REQUEST_S, ConnectionLimit
 
@@ -152,7 +153,7 @@ class ConsoleServer:
 
     @staticmethod
     def _has_token(request: web.Request, token: str) -> bool:
-        return token != "" and hmac.compare_digest(request.query.get("token", "").encode(), token.encode())
+        return token != "" and is_token(request.query.get("token", ""), token)
 
     def _console(self, request: web.Request) -> Console:
         """Return the console of the head that a request names; default: the first."""
@@ -178,9 +179,9 @@ class ConsoleServer:
             response.force_close()
             return response
         try:
-            event = json.loads(body)
-        except (ValueError, RecursionError):
-            raise EmulatorError("report: not JSON") from None
+            event = parse_object(body)
+        except JsonError as error:
+            raise EmulatorError(f"report: {error}") from None
         self._consoles[0].runs.report(event)
         return web.json_response({"ok": True})
 
@@ -242,11 +243,9 @@ async def _receive(
         if message.type is not WSMsgType.TEXT:
             continue
         try:
-            request = json.loads(message.data)
-        except (ValueError, RecursionError):
-            request = None
-        if not isinstance(request, dict):
-            viewer.send(json.dumps({"type": "answer", "id": None, "ok": False, "error": "not a JSON object"}))
+            request = parse_object(message.data)
+        except JsonError as error:
+            viewer.send(json.dumps({"type": "answer", "id": None, "ok": False, "error": str(error)}))
             continue
         if len(tasks) > MAX_REQUESTS:
             error = f"more than {MAX_REQUESTS} requests at a time"

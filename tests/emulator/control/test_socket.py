@@ -123,7 +123,14 @@ def test_a_path_that_cannot_be_is_rejected_in_one_line(run, path, said):
 def test_with_a_token_nothing_is_done_without_it(run, control):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
-            for wrong in ({}, {"token": ""}, {"token": "sesam"}, {"token": 3}, {"token": None}):
+            for wrong in (
+                {},
+                {"token": ""},
+                {"token": "sesam"},
+                {"token": 3},
+                {"token": None},
+                {"token": "\ud800"},
+            ):
                 answer = await control.do("quit", id=7, **wrong)
                 assert answer == {
                     "id": 7,
