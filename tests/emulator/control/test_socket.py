@@ -14,6 +14,7 @@ from starhil.emulator.control.channel import MAX_LINE
 from starhil.emulator.control.socket import ControlSocket
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
+from starhil.emulator.symlink_lock import lock_name
 from tests.emulator.runs import Control
 
 
@@ -78,6 +79,29 @@ def test_a_socket_that_a_killed_emulator_left_is_replaced(run, tmp_path):
 
     run(scenario, options=RunOptions(control=f"unix:{path}"))
     assert not path.exists()
+
+
+def test_default_sockets_of_killed_emulators_are_removed_and_others_are_left(run, runtime_folder):
+    folder = runtime_folder / "starhil"
+    folder.mkdir(mode=0o700)
+    (folder / "control-text").write_text("of great worth")
+    for name in ("control-1", "control-2", "other-1"):
+        with socket.socket(socket.AF_UNIX) as dead:
+            dead.bind(str(folder / name))
+    with (
+        socket.socket(socket.AF_UNIX) as listening,
+        socket.socket(socket.AF_UNIX) as starting,
+        lock_name("control", os.fsencode(folder / "control-4")),
+    ):
+        listening.bind(str(folder / "control-3"))
+        listening.listen()
+        starting.bind(str(folder / "control-4"))
+
+        async def scenario(emulation, _line):
+            return {path.name for path in folder.iterdir()}
+
+        found = run(scenario)
+    assert found == {"control-3", "control-4", "control-text", "other-1", f"control-{os.getpid()}"}
 
 
 def test_a_path_in_use_is_rejected_and_left_alone(run, tmp_path):
