@@ -1,6 +1,7 @@
 """The console's server: who may look, what a page receives, pages that do not read, heads, and reports of runs."""
 
 import asyncio
+import json
 import socket
 from contextlib import AsyncExitStack
 from dataclasses import replace
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from starhil.emulator.console.history import COLUMNS, MODES
+from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
 from starhil.emulator.errors import EmulatorError
 from starhil.hil_tests.errors import BenchError
@@ -361,6 +363,44 @@ def test_a_session_reports_its_results_to_the_console_as_they_arrive(run):
             assert [result["name"] for result in report["results"]] == ["the device answers", "it tracks"]
 
     run(scenario, options=OPTIONS)
+
+
+def test_a_result_with_very_much_traffic_is_reported_with_its_last_lines(run):
+    async def scenario(emulation, _line):
+        async with Page(emulation) as page:
+            feed = await asyncio.to_thread(
+                RunFeed, emulation.ready_fields["view"], kind="conformance", title="", unit="", planned=1
+            )
+            lines = tuple(f"-> {number} " + "00 " * 40 for number in range(10_000))
+            feed.result(id="1", name="a case", status="failed", log=lines)
+            shown = (await page.message("result"))["result"]["log"]
+            assert shown == [line[:300] for line in lines[-len(shown) :]]
+            assert len(shown) >= 100
+            await asyncio.to_thread(feed.close)
+            await page.message("run", lambda item: item["end_s"] is not None)
+
+    run(scenario, options=OPTIONS)
+
+
+def test_results_of_any_size_are_kept_in_bounded_memory():
+    """A peer may send 2000 results of a megabyte in each of 20 runs."""
+    runs = Runs()
+    texts = dict.fromkeys(("id", "name", "link", "detail", "unknown"), "x" * 50_000)
+    for name in "ab":
+        runs.report({"event": "begin", "run": name, "planned": 10**400})
+        for number in range(200):
+            log = [*["y" * 100] * 1000, *[""] * 1000, {"z": number}]
+            result = {**texts, "status": "failed", "seconds": 10**400, "log": log}
+            runs.report({"event": "result", "run": name, "result": result})
+    sizes = [len(message) for message in runs.messages()]
+    assert len(sizes) == 2
+    assert max(sizes) < 2_000_000
+    last = json.loads(list(runs.messages())[-1])
+    assert last["counts"]["failed"] == len(last["results"]) == 200
+    assert last["planned"] == 0
+    assert last["results"][-1]["log"][-1] == "{'z': 199}"
+    assert "log" not in last["results"][0]
+    assert "unknown" not in last["results"][0]
 
 
 def test_a_report_to_no_console_is_an_error_in_one_line(run):
