@@ -10,6 +10,8 @@ import aiohttp
 import numpy as np
 import pytest
 
+from starhil.emulator.console import server
+from starhil.emulator.console.console import Console
 from starhil.emulator.console.history import COLUMNS, MODES
 from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
@@ -339,6 +341,110 @@ def test_a_page_that_does_not_read_keeps_a_bounded_queue_and_the_newest_image():
         pump.cancel()
 
     asyncio.run(scenario())
+
+
+class KeepingSocket:
+    """Keeps what is sent."""
+
+    def __init__(self):
+        self.sent = []
+
+    async def send_str(self, text):
+        self.sent.append(text)
+
+    async def send_bytes(self, data):
+        self.sent.append(data)
+
+
+def test_an_image_waits_until_the_last_is_acknowledged_and_one_that_is_dropped_leaves_its_numbers():
+    async def scenario():
+        socket_ = KeepingSocket()
+        viewer = Viewer(socket_)
+        for number in range(4):
+            viewer.send_frame(b"image %d" % number, f"numbers {number}")
+            await viewer.flush()
+        assert socket_.sent == [b"image 0", "numbers 1", "numbers 2"]
+        viewer.acknowledge()
+        await viewer.flush()
+        assert socket_.sent[3:] == [b"image 3"]
+
+    asyncio.run(scenario())
+
+
+def test_a_slow_page_gets_only_the_last_of_each_state():
+    async def scenario():
+        socket_ = KeepingSocket()
+        viewer = Viewer(socket_)
+        for number in range(100):
+            viewer.send(f"status {number}", state="status")
+            viewer.send(f"rates {number}", state="telemetry rates")
+        viewer.send("row")
+        await viewer.flush()
+        assert socket_.sent == ["status 99", "rates 99", "row"]
+
+    asyncio.run(scenario())
+
+
+def test_a_page_that_acknowledges_no_image_gets_the_numbers_of_every_frame(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        async with Page(emulation) as page:
+            page.acknowledges = False
+            await page.ask(do="subscribe", frames=True)
+            await emulation.stepper.step(5.0)
+            newest = emulation.device.cycle.published
+            assert newest >= 4
+
+            def numbers():
+                rows = [head["row"] for head, _ in page.frames]
+                rows += [item["row"] for item in page.messages if item["type"] == "row"]
+                return [column(row, "frame") for row in rows]
+
+            await page.until(lambda: len(numbers()) == newest - 1)
+            assert numbers() == list(range(1, newest))
+            assert len(page.frames) == 1
+            await page.socket.send_str(json.dumps({"do": "received"}))
+            await page.until_frame(newest)
+
+    run(scenario, options=OPTIONS)
+
+
+def test_the_requests_of_a_page_come_at_most_so_often(run, monkeypatch):
+    times = []
+    subscribe = Console._subscribe
+
+    async def noted(self, viewer, request):
+        times.append(asyncio.get_running_loop().time())
+        return await subscribe(self, viewer, request)
+
+    monkeypatch.setattr(Console, "_subscribe", noted)
+
+    async def scenario(emulation, _line):
+        async with Page(emulation, field="view_only") as page:
+            for number in range(30):
+                text = json.dumps({"id": number, "do": "subscribe", "wire": number % 2 == 0, "frames": True})
+                await page.socket.send_str(text)
+            await page.message("answer", lambda item: item["id"] == 29)
+
+    run(scenario, options=replace(OPTIONS, view_token="look"))
+    assert len(times) == 30
+    assert min(np.diff(times)) >= server.PAGE_TURN_S
+
+
+def test_a_long_history_is_sent_in_parts_and_a_row_that_comes_meanwhile_is_among_them(run, monkeypatch):
+    monkeypatch.setattr(server, "HISTORY_PART", 3)
+
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        await emulation.stepper.step(5.0)
+        async with Page(emulation) as page:
+            frames = column(page.history.T, "frame")
+            assert len(page.history) > 6
+            assert list(frames[~np.isnan(frames)]) == list(range(1, emulation.device.cycle.published + 1))
+
+    run(scenario, options=OPTIONS)
 
 
 def test_a_session_reports_its_results_to_the_console_as_they_arrive(run):
