@@ -12,6 +12,7 @@ import pytest
 
 from starhil.emulator.control.channel import MAX_LINE
 from starhil.emulator.control.socket import ControlSocket
+from starhil.emulator.control.token import check_token
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.symlink_lock import lock_name
@@ -215,3 +216,9 @@ def test_no_answer_quotes_a_file(run, tmp_path):
             assert "s3cr3t" not in answer["error"]
 
     run(scenario)
+
+
+@pytest.mark.parametrize("token", ["", "a\nb", "\udcff"])
+def test_a_token_that_cannot_stand_in_an_address_is_rejected(token):
+    with pytest.raises(EmulatorError, match="--view-token: must be a text that can be printed"):
+        check_token("--view-token", token)
