@@ -1,55 +1,90 @@
-"""JSON objects, one per line, with limited length and without repeated keys."""
+"""JSON objects, one per line, with limited length, without repeated keys and with finite numbers only."""
 
 from __future__ import annotations
 
 import asyncio
 import json
+import math
 from collections.abc import AsyncIterator
-from typing import Any
+from typing import Any, Final
+
+TURN: Final = 4096
+"""Maximum number of bytes read before other tasks run."""
+
+QUOTED: Final = 100
+"""Longest part of a key that an error quotes, characters."""
 
 
-class RepeatedKeyError(ValueError):
-    """An object has a key twice, so its value is ambiguous."""
+class JsonError(ValueError):
+    """A line is not an unambiguous JSON object; the text is the reason."""
 
 
-def parse_json(line: bytes | str) -> Any:
-    """Decode one line; RepeatedKeyError names a repeated key, ValueError and RecursionError mean that it is not JSON."""
-    return json.loads(line, object_pairs_hook=_without_repeats)
+def parse_object(line: bytes | str) -> dict[str, Any]:
+    """Decode a JSON object.
+
+    Raises JsonError, also for what Python would accept but no answer can repeat: NaN and infinite numbers.
+    """
+    try:
+        content = json.loads(line, object_pairs_hook=_table)
+    except JsonError:
+        raise
+    except (ValueError, RecursionError):
+        content = None
+    if not isinstance(content, dict):
+        raise JsonError("not a JSON object on one line")
+    return content
 
 
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for key, value in pairs:
         if key in values:
-            raise RepeatedKeyError(f"key {key!r} is repeated")
+            raise JsonError(f"key {key[:QUOTED]!r} is repeated")
+        wrong = _not_finite(value)
+        if wrong is not None:
+            raise JsonError(f"{key[:QUOTED]}: {wrong!r} is not a finite number")
         values[key] = value
     return values
 
 
+def _not_finite(value: object) -> float | None:
+    """Return the first number in a value that is not finite, apart from tables, which have been checked."""
+    if isinstance(value, list):
+        return next((wrong for wrong in map(_not_finite, value) if wrong is not None), None)
+    return value if isinstance(value, float) and not math.isfinite(value) else None
+
+
 async def read_lines(
-    reader: asyncio.StreamReader, end: bytes = b"\n", *, within_s: float | None = None
+    reader: asyncio.StreamReader, limit: int, end: bytes = b"\n", *, within_s: float | None = None
 ) -> AsyncIterator[bytes | None]:
-    """Yield each line until the peer closes; None for a line above the reader's limit, which is dropped.
+    """Yield each line that is not blank until the peer closes; None for a line longer than `limit` bytes, which is dropped.
 
     A line that has begun must be complete within `within_s` seconds, or TimeoutError is raised; a peer may be silent between
-    lines. The terminator is then one byte, and the first byte of a line does not count towards the reader's limit.
+    lines. Other tasks run after each line and after each `TURN` bytes.
     """
-    too_long = False
+    rest, searched, too_long = bytearray(), 0, False
+    late_s: float | None = None
     while True:
-        begun = b""
-        try:
-            if within_s is not None and not too_long:
-                begun = await reader.readexactly(1)
-            async with asyncio.timeout(within_s):
-                line = begun if begun == end else begun + await reader.readuntil(end)
-        except asyncio.LimitOverrunError as overrun:
-            await reader.readexactly(overrun.consumed)
+        async with asyncio.timeout_at(late_s):
+            chunk = await reader.read(TURN)
+        rest += chunk
+        while (at := rest.find(end, searched)) >= 0:
+            line = bytes(rest[: at + len(end)])
+            del rest[: len(line)]
+            if too_long or at > limit:
+                yield None
+            elif not line[:at].isspace() and at:
+                yield line
+                await asyncio.sleep(0)
+            searched, too_long, late_s = 0, False, None
+        if len(rest) >= limit + len(end):
+            del rest[: len(rest) - len(end) + 1]  # which may be the begin of `end`
             too_long = True
-            continue
-        except asyncio.IncompleteReadError as rest:
-            if too_long or begun + rest.partial:
-                yield None if too_long else begun + rest.partial
+        if not chunk:
+            if too_long or rest.strip():
+                yield None if too_long or len(rest) > limit else bytes(rest)
             return
-        yield None if too_long else line
-        too_long = False
-        await asyncio.sleep(0)  # many lines may have arrived at once: other tasks run in between
+        searched = max(0, len(rest) - len(end) + 1)
+        if within_s is not None and late_s is None and (rest or too_long):
+            late_s = asyncio.get_running_loop().time() + within_s
+        await asyncio.sleep(0)

@@ -159,7 +159,13 @@ class Emulator:
         return "ready " + " ".join(f"{key}={value}" for key, value in fields.items())
 
     async def close(self) -> None:
-        """Close control channel, console, heads and logs, even if one fails to close."""
+        """Close control channel, console, heads and logs, even if one fails to close.
+
+        First of all, nothing more is received: closing takes many turns of the loop, which a storm of requests makes long.
+        """
+        for head in self.run.heads:
+            for link in head.links:
+                link.transport.stop_receiving()
         recorder = self.run.recorder
         closers: list[Callable[[], object]] = [*reversed(self._closers), self.run.close]
         self._closers.clear()

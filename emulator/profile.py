@@ -6,7 +6,6 @@ is validated; an error names the file, the key and the remedy.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
@@ -45,6 +44,7 @@ from starhil.emulator.truth.config import (
 from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import DEFAULT_UNIT, bundled_units, find, not_found, remedy
+from starhil.protocol.user_file import TomlError, parse_toml
 from starhil.protocol.validation_messages import problems
 from starid.earth import unix_time
 
@@ -386,8 +386,8 @@ def _apply_override(values: dict[str, Any], override: str) -> Layer:
     if not equals or not all(names):
         raise EmulatorError(f"--set {override}: write section.key=value, e.g. parameters.update_rate=5")
     try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, RecursionError):
+        value = parse_toml(f"value = {text}")["value"]
+    except TomlError:
         value = text
     table = values
     for name in names[:-1]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.protocol.names import Kind, find, not_found
-from starid.files import read_text
+from starhil.protocol.user_file import TomlError, read_user_toml
 
 
 def find_toml(kind: Kind, name_or_path: str, relative_to: Path = Path()) -> Path:
@@ -26,11 +25,6 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     """Read a TOML file; `what` is its kind, for messages: `profile`, `scenario`."""
     try:
         with explained(f"{what} {path}: cannot be read", "give a TOML file"):
-            text = read_text(path)
-        return tomllib.loads(text)
-    except UnicodeDecodeError as error:
-        raise EmulatorError(f"{what} {path}: not UTF-8 ({error.reason}); give a TOML file") from None
-    except tomllib.TOMLDecodeError as error:
-        raise EmulatorError(f"{what} {path}: not TOML ({error})") from None
-    except RecursionError:
-        raise EmulatorError(f"{what} {path}: nested too deeply") from None
+            return read_user_toml(path)
+    except TomlError as error:
+        raise EmulatorError(f"{what} {path}: not valid TOML: {error}") from None

@@ -1,6 +1,7 @@
 """A headless viewer of the console, for measurements: `python -m starhil.hil_tests.console_viewer ADDRESS`.
 
-Like an open page, it subscribes to images and to the rows that the page shows first, and reads everything.
+Like an open page, it subscribes to images and to the rows that the page shows first, reads everything, and acknowledges each
+image.
 """
 
 from __future__ import annotations
@@ -24,8 +25,9 @@ async def view(address: str) -> None:
         session.ws_connect(f"http://{parts.netloc}/ws?{parts.query}", max_msg_size=0) as socket,
     ):
         await socket.send_str(json.dumps({"id": 1, "do": "subscribe", "frames": True, "rows": ROWS}))
-        async for _ in socket:
-            pass
+        async for message in socket:
+            if message.type is aiohttp.WSMsgType.BINARY and message.data[:1] == b"F":
+                await socket.send_str(json.dumps({"do": "received"}))
 
 
 if __name__ == "__main__":

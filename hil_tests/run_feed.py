@@ -21,6 +21,10 @@ TIMEOUT_S: Final = 5.0
 MAX_WAITING: Final = 5000
 """Number of results that may wait for a slow console; further ones are not shown."""
 
+SHOWN_LINES: Final = 200
+LONGEST_LINE: Final = 300
+"""Longest line of traffic, characters; a console rejects a report of more than a megabyte."""
+
 ENDED_WITHIN_S: Final = 10.0
 """Maximum time for which the end of a run waits for the console, seconds."""
 
@@ -57,8 +61,10 @@ class RunFeed:
         """Report a result.
 
         Its `status` is `passed`, `failed`, `skipped` or `not run`; the console also shows `id`, `name`, `link`, `seconds`,
-        `detail` and the lines of traffic `log`, of which any may be missing.
+        `detail` and the last lines of traffic `log`, of which any may be missing.
         """
+        if "log" in content:
+            content["log"] = [line[:LONGEST_LINE] for line in content["log"][-SHOWN_LINES:]]
         try:
             self._waiting.put_nowait({"event": "result", "result": content})
         except queue.Full:

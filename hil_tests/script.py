@@ -6,7 +6,6 @@ reported, one a line, with file, step, key and near matches.
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar
 
@@ -14,10 +13,10 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.expect import Keys, StatedAttitude
-from starhil.hil_tests.steps import ACTIONS, FileName, Link, Positive, Step, Texts
+from starhil.hil_tests.steps import ACTIONS, FileName, Link, Step, Texts, Timeout
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.names import did_you_mean
-from starhil.protocol.user_file import read_user_text
+from starhil.protocol.user_file import TomlError, read_user_toml
 from starhil.protocol.validation_messages import problems
 
 Table = TypeVar("Table", bound=Keys)
@@ -46,7 +45,7 @@ class EmulatorRequest(Keys):
 class Defaults(Keys):
     """Defaults for all steps."""
 
-    timeout_s: Positive = 1.0
+    timeout_s: Timeout = 1.0
     retries: Annotated[int, Field(ge=0)] = 0
     keep_going: bool = False
     link: Link | None = None
@@ -81,11 +80,10 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
     one line for each error.
     """
     try:
-        document = tomllib.loads(read_user_text(path))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not a text file"
-        raise ScriptError(f"{path}: cannot be read: {reason}") from None
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        document = read_user_toml(path)
+    except OSError as error:
+        raise ScriptError(f"{path}: cannot be read: {error.strerror}") from None
+    except TomlError as error:
         raise ScriptError(f"{path}: not valid TOML: {error}") from None
     if "step" not in document:
         hint = did_you_mean("step", document) or f"; its keys are {', '.join(document) or 'none'}"

@@ -26,7 +26,6 @@ from starhil.hil_tests.expect import (
     AttitudeCheck,
     Conditions,
     Keys,
-    NonNegative,
     Operand,
     ReadConditions,
     ReadOperand,
@@ -128,7 +127,7 @@ def _as_json(table: dict[str, Any]) -> dict[str, Any]:
 
 
 def _file_name(name: str) -> str:
-    if name in {"", ".."} or Path(name).name != name or "\0" in name:
+    if name in {"", ".."} or Path(name).name != name:
         raise ValueError("must be a plain file name; the file is written to the log folder")
     return name
 
@@ -146,7 +145,10 @@ Pattern = Annotated[str, _read_by(lambda text, _icd: pattern(text))]
 Patterns = Annotated[list[Pattern], BeforeValidator(_as_list)]
 FileName = Annotated[str, AfterValidator(_file_name)]
 Texts = Annotated[list[str], BeforeValidator(_as_list)]
-Positive = Annotated[float, Field(ge=0.001)]
+LONGEST_S: Final = 1e6
+"""Longest time in a session, seconds: eleven days."""
+Duration = Annotated[float, Field(ge=0.0, le=LONGEST_S)]
+Timeout = Annotated[float, Field(ge=0.001, le=LONGEST_S)]
 Count = Annotated[int, Field(ge=1)]
 Link = Literal["serial", "can", "both"]
 
@@ -215,12 +217,12 @@ class Step(Keys):
     """Variable → field."""
     link: Link | None = None
     repeat: Count = 1
-    every_s: NonNegative = 0.2
-    within_s: NonNegative | None = None
+    every_s: Duration = 0.2
+    within_s: Duration | None = None
     """Repeat until the expectations hold, for at most this long."""
-    timeout_s: Positive | None = None
+    timeout_s: Timeout | None = None
     retries: Annotated[int, Field(ge=0)] = 0
-    max_latency_s: NonNegative | None = None
+    max_latency_s: Duration | None = None
 
     @abstractmethod
     def run(self, session: Session, link: str) -> Attempt:
@@ -410,8 +412,8 @@ class Sample(ReadingStep):
 
     default_name = "sample {self.row.name}"
     row: Readable = Field(alias="sample")
-    every_s: NonNegative
-    for_s: NonNegative
+    every_s: Duration
+    for_s: Duration
     file: FileName = ""
     at_least: Annotated[float, Field(ge=0.0, le=1.0)] = 1.0
     """Fraction of the samples for which the expectations must hold."""
@@ -559,7 +561,7 @@ class Send(Step):
     default_name = "send raw data"
     data: RawItems = Field(alias="send")
     answer: Patterns | None = None
-    listen_s: NonNegative = 0.3
+    listen_s: Duration = 0.3
 
     @model_validator(mode="after")
     def _on_the_link_of_its_format(self) -> Self:
@@ -587,7 +589,7 @@ class Wait(Step):
 
     default_name = "wait {self.seconds:g} s"
     needs_link = False
-    seconds: NonNegative = Field(alias="wait_s")
+    seconds: Duration = Field(alias="wait_s")
 
     def run(self, session: Session, link: str) -> Attempt:  # noqa: ARG002 -- any session, no link
         """Wait."""

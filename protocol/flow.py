@@ -98,6 +98,13 @@ def limit_buffers(transport: asyncio.BaseTransport) -> None:
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, option, WINDOW)
 
 
+def limit_unsent(transport: asyncio.BaseTransport) -> None:
+    """Limit what a TCP connection buffers before it is sent, without a limit of what is under way."""
+    cast("asyncio.WriteTransport", transport).set_write_buffer_limits(WINDOW)
+    connection = transport.get_extra_info("socket")
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, WINDOW)
+
+
 def detect_lost_peer(transport: asyncio.BaseTransport, *, must_read: bool = False) -> None:
     """Close a silent TCP connection within about ten seconds after the other machine has disappeared.
 

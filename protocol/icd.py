@@ -8,7 +8,6 @@ error names file, table and key, and what to write instead.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -31,7 +30,7 @@ from starhil.protocol.messages import ErrorCode, RequestKind
 from starhil.protocol.names import DEFAULT_UNIT, UNITS_FOLDER, did_you_mean, find_unit
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.user_file import read_user_text
+from starhil.protocol.user_file import TomlError, read_user_toml
 from starhil.protocol.validation_messages import Problem, problems
 from starhil.protocol.values import (
     FieldError,
@@ -47,6 +46,7 @@ SETS: Final = "set_"
 """Prefix of the names of telecommands that can be read back."""
 HIGHEST_ID: Final = 0xFF
 """Highest ID if the link does not limit it."""
+MAX_ROWS: Final = 65536
 
 CLASS: Final = "class"
 """Table of the classes; among the broken names if a class is missing."""
@@ -116,6 +116,7 @@ class _Reader:
         self._removed: list[tuple[Path, RequestKind, Any]] = []
         """Rows that are not valid, with their files."""
         self._rows: dict[str, Row] = {}
+        self._expanded = 0
         self._ids: dict[tuple[int | None, int], str] = {}
         """Code of the class and ID → name of the row."""
         for file in files:
@@ -143,12 +144,12 @@ class _Reader:
     def _read(self, file: Path) -> None:
         """Read and validate one file."""
         try:
-            document = tomllib.loads(read_user_text(file))
+            document = read_user_toml(file)
         except OSError as error:
             self.errors.append(f"{file}: cannot read the interface definition: {error.strerror}")
             self._unread = True
             return
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
+        except TomlError as error:
             self.errors.append(f"{file}: not valid TOML: {error}")
             self._unread = True
             return
@@ -304,9 +305,7 @@ class _Reader:
         provenance = model.provenance or self._unit.provenance
         if provenance is None:
             raise IcdError("needs `provenance`, here or in [unit]")
-        last = model.id if model.last_id is None else model.last_id
-        if last < model.id:
-            raise IcdError(f"last_id {last} is below ID {model.id}")
+        ids = self._ids_of(model)
         if kind == "telecommand" and model.unsolicited is not None:
             raise IcdError("only telemetry is sent unsolicited")
         if kind == "telecommand" and model.request is False:
@@ -324,8 +323,12 @@ class _Reader:
             klass = ""
         elif answers is None:
             answers = self._classes[klass].answer
-        for number, row_id in enumerate(range(model.id, last + 1), 1):
-            single = model.last_id is None
+        single = model.last_id is None
+        errors = len(self.errors)
+        for number, row_id in enumerate(ids, 1):
+            if len(self.errors) > errors:  # the others would repeat it
+                self._broken |= {f"{model.name}_{rest}" for rest in range(number, len(ids) + 1)}
+                return
             layout = Layout(self._icd, kind, provenance, None if single else number)
             for name in model.include or ():
                 with Located("include"):
@@ -361,6 +364,16 @@ class _Reader:
                 only_sent=model.request is False,
             )
             self._add_row(row, file, complete=model.name not in self._broken)
+
+    def _ids_of(self, model: schema.RowModel) -> range:
+        """Return the IDs of the rows to which an entry expands."""
+        ids = range(model.id, (model.id if model.last_id is None else model.last_id) + 1)
+        if not ids:
+            raise IcdError(f"last_id {model.last_id} is below ID {model.id}")
+        self._expanded += len(ids)
+        if self._expanded > MAX_ROWS:
+            raise IcdError(f"last_id {ids[-1]} makes {len(ids)} rows; a unit has at most {MAX_ROWS}")
+        return ids
 
     def _add_row(self, row: Row, file: Path, *, complete: bool) -> None:
         where = f"{file}: {row.kind} {row.name}"

@@ -35,8 +35,8 @@ FieldType = Literal[
 class UnitModel(DefinitionModel):
     """Name, version and description of a unit."""
 
-    name: str
-    """Name of the unit."""
+    name: Annotated[str, Field(max_length=100)]
+    """Name of the unit; files of exports are called after it."""
     version: str
     """Version of the definition."""
     doc: str
@@ -175,7 +175,7 @@ class RowModel(RowKeys):
 
     last_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
     """Expands to the rows name_1 … with the IDs `id` to `last_id` and the same layout; `[n]` is the number of
-    the row."""
+    the row. A unit has at most 65536 rows."""
     klass: str | None = Field(default=None, alias="class")
     """Class of the row; required if the unit has several classes of its kind."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None

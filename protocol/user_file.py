@@ -1,15 +1,29 @@
-"""Reading of files named by a user: regular files only, up to a size limit."""
+"""Reading of files named by a user: regular files only, up to a size limit; and of TOML, which may come from one."""
 
 from __future__ import annotations
 
 import errno
 import os
+import re
 import stat
+import tomllib
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 MAX_BYTES: Final = 10_000_000
 """Default size limit, bytes."""
+
+MAX_DEPTH: Final = 64
+"""Maximum depth of tables and lists in TOML."""
+
+TOO_WIDE: Final = "a whole number does not fit 64 bits"
+
+_TOO_LONG: Final = re.compile(r"[0-9][0-9_]{4300}")
+"""A decimal number with more digits than Python converts."""
+
+
+class TomlError(ValueError):
+    """Text is not TOML, or has a value that nothing can use; the text is the reason."""
 
 
 class UnsuitableFileError(OSError):
@@ -46,3 +60,51 @@ def read_user_text(path: Path, limit: int = MAX_BYTES) -> str:
     Raises as `read_user_file`, and UnicodeDecodeError.
     """
     return read_user_file(path, limit).decode("utf-8-sig")
+
+
+def read_user_toml(path: Path) -> dict[str, Any]:
+    """Return the document of a TOML file.
+
+    Raises as `read_user_file`, and TomlError.
+    """
+    try:
+        text = read_user_text(path)
+    except UnicodeDecodeError as error:
+        raise TomlError(f"not UTF-8: {error.reason} (at byte {error.start})") from None
+    return parse_toml(text)
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the document that a TOML text describes.
+
+    Raises TomlError also for what Python would accept, but no path, message or field can hold: a whole number of more
+    than 64 bits, the character NUL, and tables deeper than `MAX_DEPTH`.
+    """
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise TomlError(str(error)) from None
+    except RecursionError:
+        raise TomlError("nested too deeply") from None
+    except ValueError:
+        found = _TOO_LONG.search(text)
+        line = "" if found is None else f" (at line {text.count(chr(10), 0, found.start()) + 1})"
+        raise TomlError(TOO_WIDE + line) from None
+    if wrong := _unusable(document, MAX_DEPTH):
+        raise TomlError(wrong.removeprefix("."))
+    return document
+
+
+def _unusable(value: object, depth: int) -> str:
+    """Return the first value that cannot be used as `.key.key: reason`; empty if there is none."""
+    if isinstance(value, (dict, list)):
+        if not depth:
+            return ": nested too deeply"
+        for name, below in value.items() if isinstance(value, dict) else (("", each) for each in value):
+            if wrong := _unusable(below, depth - 1):
+                return f".{name}{wrong}" if name else wrong
+    elif isinstance(value, int) and not -(1 << 63) <= value < 1 << 64:
+        return f": {TOO_WIDE}"
+    elif isinstance(value, str) and "\0" in value:
+        return ": has the character NUL"
+    return ""

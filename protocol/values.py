@@ -19,7 +19,7 @@ from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.names import did_you_mean
 
-Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=100)]
 ParameterType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64", "bool", "enum8"]
 _Scalar = TypeVar("_Scalar", bound=bool | int | float | str)
 LARGEST: Final = 1e100

@@ -76,6 +76,10 @@ def load_camera(path: str | Path) -> Camera:
         raise StaridError(f"camera profile {source}: cannot be read ({error.strerror})") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise StaridError(f"camera profile {source}: is not valid TOML ({error}); correct it") from None
+    except ValueError:
+        raise StaridError(
+            f"camera profile {source}: is not valid TOML (a number has too many digits); correct it"
+        ) from None
     table = content.get("camera")
     if not isinstance(table, dict):
         raise StaridError(

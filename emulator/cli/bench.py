@@ -54,7 +54,7 @@ def latency(
         list[float] | None,
         typer.Option("--rate", min=0.0, help="Update rate, Hz; 0 is standby. Repeatable."),
     ] = None,
-    seconds: Annotated[float, typer.Option(min=1.0, help="Time per rate.")] = 15.0,
+    seconds: Annotated[float, typer.Option(min=1.0, max=1e6, help="Time per rate.")] = 15.0,
     workers: Annotated[
         list[str] | None, typer.Option("--worker", help="process or thread. Repeatable.")
     ] = None,
@@ -198,7 +198,7 @@ class TargetOptions:
 @with_option_groups
 def bus(
     *,
-    seconds: Annotated[float, typer.Option(min=1.0, help="Time per link.")] = 60.0,
+    seconds: Annotated[float, typer.Option(min=1.0, max=1e6, help="Time per link.")] = 60.0,
     rate: Annotated[float, typer.Option(min=0.0, help="CAN frames per second from other nodes.")] = 7000.0,
     p99_limit_ms: Annotated[
         float, typer.Option(help="Limit for the 99th percentile of CAN reply latency, milliseconds.")

@@ -65,7 +65,7 @@ class CaseOptions:
             help="Bit rate of the serial line. Default: 115200, without checking the pace of replies."
         ),
     ] = None
-    time_out: Annotated[float, typer.Option(min=0.01, help="Timeout for a reply, seconds.")] = 1.0
+    time_out: Annotated[float, typer.Option(min=0.01, max=1e6, help="Timeout for a reply, seconds.")] = 1.0
 
     def request(
         self, bench: BenchOptions, patterns: tuple[str, ...], *, list_only: bool

@@ -157,12 +157,14 @@ class AroundOptions:
     def run_options(self) -> RunOptions:
         """Return the options of the run; the folders of its files are created."""
         from starhil.emulator.cli.console_client import ConsoleClient
+        from starhil.emulator.control.token import check_token
         from starhil.emulator.launch import RunOptions
 
-        if self.control_token is not None and not self.control_token:
-            raise EmulatorError("--control-token: empty; give a text, or omit the option")
-        if self.view_token is not None and (not self.view_token or self.view == "off"):
-            raise EmulatorError("--view-token: needs a text, and --view")
+        for option, token in (("--control-token", self.control_token), ("--view-token", self.view_token)):
+            if token is not None:
+                check_token(option, token)
+        if self.view_token is not None and self.view == "off":
+            raise EmulatorError("--view-token: needs --view")
         folder, mcap = (_one_path(self.record, mcap=mcap) for mcap in (False, True))
         for path, option in ((self.truth_log, "--truth-log"), (mcap, "--record")):
             if path is not None:

@@ -70,6 +70,8 @@ class Console:
         """The latest message with an image; empty before the first."""
         self._unresponsive_since_s: float | None = None
         """Simulation time since which the device is unresponsive, seconds; None if it is not."""
+        self._hello: dict[str, Any] = {}
+        """The description of the run for pages; empty before the first page."""
         self.viewers: set[Viewer] = set()
         self._tasks: list[asyncio.Task[None]] = []
         self._rows_wanted = asyncio.Event()
@@ -152,24 +154,29 @@ class Console:
         else:
             self._status_due.clear()
 
-    async def welcome(self, viewer: Viewer) -> bytes:
-        """Send the description of the run to a page; return the history as rows of 64-bit floats."""
-        stars = await self._stars if self._stars is not None else {}
-        content = describe(self._run, self._head) | stars
-        viewer.send(json.dumps({"type": "hello", "view_only": not viewer.commands, **content}))
+    async def welcome(self, viewer: Viewer) -> None:
+        """Send the description of the run to a page."""
+        if not self._hello:
+            stars = await self._stars if self._stars is not None else {}
+            self._hello = describe(self._run, self._head) | stars
+        viewer.send(json.dumps({"type": "hello", "view_only": not viewer.commands, **self._hello}))
         viewer.send(json.dumps({"type": "reasons", "reasons": self.history.reasons}))
         for message in self.runs.messages():
             viewer.send(message)
-        return self.history.rows().tobytes()
 
     def _broadcast(
-        self, message: dict[str, Any], wants: Callable[[Viewer], bool] = lambda _viewer: True
+        self,
+        message: dict[str, Any],
+        wants: Callable[[Viewer], bool] = lambda _viewer: True,
+        *,
+        state: str = "",
     ) -> None:
+        """Send a message to pages; a page needs only the last one of a state."""
         receivers = [viewer for viewer in self.viewers if wants(viewer)]
         if receivers:
             text = json.dumps(message)
             for viewer in receivers:
-                viewer.send(text)
+                viewer.send(text, state=state)
 
     # --- listeners ---
 
@@ -180,16 +187,17 @@ class Console:
         data = frame_message(measurement, row)
         if measurement.result.preview is not None:
             self._last_frame = data
+        numbers = json.dumps({"type": "row", "row": json_row(row)})
         for viewer in self.viewers:
             if viewer.frames:
-                viewer.send_frame(data)
+                viewer.send_frame(data, numbers)
 
     def _with_reasons(self, add: Callable[[], list[float]]) -> list[float]:
         """Add a row to the history and return it; its reason, if new, is sent to the pages."""
         known = len(self.history.reasons)
         row = add()
         if len(self.history.reasons) != known:
-            self._broadcast({"type": "reasons", "reasons": self.history.reasons})
+            self._broadcast({"type": "reasons", "reasons": self.history.reasons}, state="reasons")
         return row
 
     def _mode_changed(self, transition: Transition) -> None:
@@ -219,10 +227,20 @@ class Console:
             self.trace.discard()
             return
         lines, left_out = self.trace.drain()
-        if lines:
-            self._broadcast(
-                {"type": "wire", "lines": lines, "left_out": left_out}, lambda viewer: viewer.wire
-            )
+        if not lines:
+            return
+        texts: dict[int, str] = {}
+        for viewer in self.viewers:
+            if not viewer.wire:
+                continue
+            viewer.wire_left_out += left_out
+            if viewer.behind:
+                viewer.wire_left_out += len(lines)
+                continue
+            missed, viewer.wire_left_out, viewer.wire_end = viewer.wire_left_out, 0, lines[-1]["n"] + 1
+            if missed not in texts:
+                texts[missed] = json.dumps({"type": "wire", "lines": lines, "left_out": missed})
+            viewer.send(texts[missed])
 
     async def _report_status(self) -> None:
         await self._status_due.wait()
@@ -238,7 +256,8 @@ class Console:
                 "session_steps": self.obc.steps,
                 "heard": self._heard(),
                 "wall_s": time.time(),
-            }
+            },
+            state="status",
         )
         await asyncio.sleep(STATUS_S)
 
@@ -264,6 +283,7 @@ class Console:
             self._broadcast(
                 {"type": "telemetry", "row": name, "values": values, **exchange_content(exchange)},
                 partial(_shows, name),
+                state=f"telemetry {name}",
             )
             due = begin + (number + 1) * POLL_S / len(rows)
             await asyncio.sleep(max(0.005, due - time.monotonic()))
@@ -295,7 +315,9 @@ class Console:
             viewer.send_frame(self._last_frame)
         begins, viewer.wire = not viewer.wire, bool(request.get("wire"))
         if begins and viewer.wire:
-            viewer.send(json.dumps({"type": "wire", "lines": self.trace.recent(), "left_out": 0}))
+            lines = self.trace.recent(viewer.wire_end)
+            viewer.wire_end = lines[-1]["n"] + 1 if lines else viewer.wire_end
+            viewer.send(json.dumps({"type": "wire", "lines": lines, "left_out": 0}))
         known = frozenset(row.name for row in self._head.device.icd.readable)
         viewer.rows = known.intersection(rows)
         self._viewers_changed()

@@ -76,11 +76,16 @@ class History:
     def __len__(self) -> int:
         return min(self._count, len(self._rows))
 
-    def rows(self) -> Numbers:
-        """Return a copy of the rows (n, columns), oldest first."""
-        if self._count <= len(self._rows):
-            return self._rows[: self._count].copy()
-        return np.roll(self._rows, -(self._count % len(self._rows)), axis=0)
+    @property
+    def end(self) -> int:
+        """Number of rows ever added, and of the next one."""
+        return self._count
+
+    def rows(self, start: int = 0, most: int = KEPT_ROWS) -> Numbers:
+        """Return a copy of the rows (n, columns) from a number on, of those that are still kept, oldest first."""
+        first = max(start, self._count - len(self._rows))
+        numbers = np.arange(first, max(first, min(self._count, first + most)))
+        return self._rows[numbers % len(self._rows)]
 
     def _row(self, measurement: Measurement) -> list[float]:
         result, truth = measurement.result, measurement.truth

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -15,6 +15,21 @@ from starhil.emulator.signals import Signal
 KEPT_RUNS: Final = 20
 KEPT_RESULTS: Final = 2000
 STATUSES: Final = ("passed", "failed", "skipped", "not run")
+
+TEXTS: Final = {"status": 10, "id": 100, "name": 200, "link": 40, "detail": 500}
+"""Texts of a result that are kept, each with its longest length, characters."""
+
+LARGEST: Final = 1e9
+"""Number above which a count or a time is not one."""
+
+LONGEST_LINE: Final = 300
+"""Longest kept line of the traffic of a result, characters."""
+
+KEPT_LOG: Final = 20_000
+"""Size of the kept traffic of a result: its last lines; characters."""
+
+KEPT_LOGS: Final = 50
+"""Number of results of a run whose traffic is kept: the latest."""
 
 
 @dataclass
@@ -28,14 +43,25 @@ class Run:
     planned: int
     begin_s: float
     results: list[dict[str, Any]] = field(default_factory=list)
+    logs: deque[dict[str, Any]] = field(default_factory=deque)
+    """Results with their traffic, oldest first."""
     end_s: float | None = None
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(STATUSES, 0))
 
     def head(self) -> dict[str, Any]:
         """Return everything except the results."""
-        content = vars(self).copy()
-        del content["results"]
-        return content
+        return {key: value for key, value in vars(self).items() if key not in ("results", "logs")}
+
+    def add(self, result: dict[str, Any]) -> None:
+        """Count a result, and keep it if there is room."""
+        self.counts[result["status"]] += 1
+        if len(self.results) >= KEPT_RESULTS:
+            return
+        self.results.append(result)
+        if "log" in result:
+            self.logs.append(result)
+        if len(self.logs) > KEPT_LOGS:
+            del self.logs.popleft()["log"]
 
 
 class Runs:
@@ -69,7 +95,7 @@ class Runs:
             kind=str(event.get("kind", ""))[:40],
             title=str(event.get("title", ""))[:200],
             unit=str(event.get("unit", ""))[:200],
-            planned=planned if isinstance(planned, int) else 0,
+            planned=planned if isinstance(planned, int) and abs(planned) < LARGEST else 0,
             begin_s=time.time(),
         )
         self._runs[run.run] = run
@@ -82,10 +108,9 @@ class Runs:
         result = event.get("result")
         if not isinstance(result, dict) or result.get("status") not in STATUSES:
             raise EmulatorError(f"report: result needs a status, one of {', '.join(STATUSES)}")
-        run.counts[str(result["status"])] += 1
-        if len(run.results) < KEPT_RESULTS:
-            run.results.append(result)
-        self.changed.emit({"type": "result", "run": run.run, "counts": run.counts, "result": result})
+        kept = _shortened(result)
+        run.add(kept)
+        self.changed.emit({"type": "result", "run": run.run, "counts": run.counts, "result": kept})
 
     def _find(self, event: dict[str, Any]) -> Run:
         run = self._runs.get(str(event["run"]))
@@ -97,3 +122,19 @@ class Runs:
         """Yield the messages that describe all runs to a new page."""
         for run in self._runs.values():
             yield json.dumps({"type": "run", **run.head(), "results": run.results})
+
+
+def _shortened(result: dict[str, Any]) -> dict[str, Any]:
+    """Return what a page shows of a reported result, with bounded lengths."""
+    kept: dict[str, Any] = {key: str(result[key])[:most] for key, most in TEXTS.items() if key in result}
+    seconds, lines = result.get("seconds"), result.get("log")
+    if isinstance(seconds, (int, float)) and abs(seconds) < LARGEST:
+        kept["seconds"] = seconds
+    room, log = KEPT_LOG, deque[str]()
+    for line in reversed(lines if isinstance(lines, list) else []):
+        text = str(line)[:LONGEST_LINE]
+        room -= len(text) + 1
+        if room < 0:
+            break
+        log.appendleft(text)
+    return {**kept, "log": list(log)} if log else kept

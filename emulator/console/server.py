@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hmac
 import json
 import logging
 import secrets
@@ -18,9 +17,11 @@ from aiohttp.http import HttpProcessingError
 
 from starhil.emulator.console.console import Console
 from starhil.emulator.console.viewer import Viewer
+from starhil.emulator.control.token import is_token
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.json_lines import JsonError, parse_object
 from starhil.protocol.errors import reason
-from starhil.protocol.flow import REQUEST_S, ConnectionLimit
+from starhil.protocol.flow import REQUEST_S, ConnectionLimit, limit_unsent
 
 log = logging.getLogger("starhil.console")
 
@@ -39,6 +40,21 @@ HEARTBEAT_S: Final = 20.0
 """Time after which a page that does not answer is disconnected, seconds."""
 
 MAX_VIEWERS: Final = 32
+
+TURN_S: Final = 0.002
+"""Shortest time between two requests, of any pages, seconds: the links of the device are served first."""
+
+PAGE_TURN_S: Final = 0.01
+"""Shortest time between two requests of a page, seconds."""
+
+OPENING_S: Final = 0.05
+"""Shortest time between two pages that open, seconds."""
+
+HISTORY: Final = b"H" + bytes(7)
+"""Begin of a message with rows of the history."""
+
+HISTORY_PART: Final = 1000
+"""Number of rows of the history that are sent at a time."""
 
 LINGER_S: Final = 1.0
 """Time for which the rest of a rejected request is read, so that its peer receives the answer, seconds."""
@@ -72,6 +88,8 @@ class ConsoleServer:
         self._consoles = consoles
         self.token = secrets.token_urlsafe(18)
         self._view_token = view_token
+        self._turn = asyncio.Lock()
+        self._opening = asyncio.Lock()
         self._runner: web.AppRunner | None = None
         self._listener: asyncio.Server | None = None
 
@@ -127,6 +145,7 @@ class ConsoleServer:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Reject other origins and, except for static files, requests without the token."""
+        await self._wait_for_turn()
         if not all(value.isascii() for value in request.headers.values()):  # aiohttp fails on some of them
             return web.Response(status=400, text="400: a header is not ASCII\n", headers=HEADERS)
         if not _is_same_origin(request):
@@ -152,7 +171,7 @@ class ConsoleServer:
 
     @staticmethod
     def _has_token(request: web.Request, token: str) -> bool:
-        return token != "" and hmac.compare_digest(request.query.get("token", "").encode(), token.encode())
+        return token != "" and is_token(request.query.get("token", ""), token)
 
     def _console(self, request: web.Request) -> Console:
         """Return the console of the head that a request names; default: the first."""
@@ -178,9 +197,9 @@ class ConsoleServer:
             response.force_close()
             return response
         try:
-            event = json.loads(body)
-        except (ValueError, RecursionError):
-            raise EmulatorError("report: not JSON") from None
+            event = parse_object(body)
+        except JsonError as error:
+            raise EmulatorError(f"report: {error}") from None
         self._consoles[0].runs.report(event)
         return web.json_response({"ok": True})
 
@@ -191,15 +210,19 @@ class ConsoleServer:
             return web.Response(status=503, text=f"503: {MAX_VIEWERS} pages are already open\n")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE, compress=False)
         await socket.prepare(request)
+        if request.transport is not None:
+            limit_unsent(request.transport)
         viewer = Viewer(socket, commands=self._has_token(request, self.token))
-        history = await console.welcome(viewer)
         tasks: set[asyncio.Task[None]] = set()
         try:
+            async with self._opening:
+                await console.welcome(viewer)
+                await asyncio.sleep(OPENING_S)
             await viewer.flush()
-            await socket.send_bytes(b"H" + bytes(7) + history)
+            await _send_history(console, socket)
             console.join(viewer)
             tasks.add(asyncio.create_task(_pump(viewer, socket)))
-            await _receive(console, socket, viewer, tasks)
+            await self._receive(console, socket, viewer, tasks)
         except ConnectionError:
             pass  # the page was closed
         finally:
@@ -208,6 +231,39 @@ class ConsoleServer:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         return socket
+
+    async def _wait_for_turn(self) -> None:
+        """Wait until `TURN_S` have passed since the request before, of any page."""
+        async with self._turn:
+            await asyncio.sleep(TURN_S)
+
+    async def _receive(
+        self, console: Console, socket: web.WebSocketResponse, viewer: Viewer, tasks: set[asyncio.Task[None]]
+    ) -> None:
+        """Execute the requests of a page until it closes; they wait while it does not read its messages."""
+        async for message in socket:
+            await asyncio.sleep(PAGE_TURN_S)
+            await self._wait_for_turn()
+            if message.type is not WSMsgType.TEXT:
+                continue
+            try:
+                request = parse_object(message.data)
+            except JsonError as wrong:
+                viewer.send(json.dumps({"type": "answer", "id": None, "ok": False, "error": str(wrong)}))
+                continue
+            if request.get("do") == "received":
+                viewer.acknowledge()
+                continue
+            while viewer.behind:
+                await asyncio.sleep(PAGE_TURN_S)
+            if len(tasks) > MAX_REQUESTS:
+                error = f"more than {MAX_REQUESTS} requests at a time"
+                answer = {"type": "answer", "id": request.get("id"), "ok": False, "error": error}
+                viewer.send(json.dumps(answer))
+                continue
+            task = asyncio.create_task(_answer(console, viewer, request))
+            tasks.add(task)
+            task.add_done_callback(tasks.discard)
 
 
 class _ServerLog(logging.LoggerAdapter[logging.Logger]):
@@ -234,27 +290,15 @@ class _Gate(asyncio.Protocol):
             protocol.connection_made(transport)
 
 
-async def _receive(
-    console: Console, socket: web.WebSocketResponse, viewer: Viewer, tasks: set[asyncio.Task[None]]
-) -> None:
-    """Execute the requests of a page until it closes."""
-    async for message in socket:
-        if message.type is not WSMsgType.TEXT:
-            continue
-        try:
-            request = json.loads(message.data)
-        except (ValueError, RecursionError):
-            request = None
-        if not isinstance(request, dict):
-            viewer.send(json.dumps({"type": "answer", "id": None, "ok": False, "error": "not a JSON object"}))
-            continue
-        if len(tasks) > MAX_REQUESTS:
-            error = f"more than {MAX_REQUESTS} requests at a time"
-            viewer.send(json.dumps({"type": "answer", "id": request.get("id"), "ok": False, "error": error}))
-            continue
-        task = asyncio.create_task(_answer(console, viewer, request))
-        tasks.add(task)
-        task.add_done_callback(tasks.discard)
+async def _send_history(console: Console, socket: web.WebSocketResponse) -> None:
+    """Send the history in parts of rows of 64-bit floats, oldest first; the last part is empty."""
+    history, start, complete = console.history, 0, False
+    while not complete:
+        start = max(start, history.end - len(history))
+        rows = history.rows(start, HISTORY_PART)
+        start += len(rows)
+        await socket.send_bytes(HISTORY + rows.tobytes())
+        complete = not len(rows) and start == history.end  # rows may come while others are sent
 
 
 async def _answer(console: Console, viewer: Viewer, request: dict[str, object]) -> None:

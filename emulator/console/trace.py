@@ -48,6 +48,9 @@ class WireTrace:
         self._dialect = dialect
         self._decoder = Decoder(icd, dialect)
         self._count = 0
+        self._recent: deque[dict[str, Any]] = deque(maxlen=DECODED_PER_TURN)
+        self._recent_end = 0
+        self._recent_decoder = self._decoder
         self._kept: deque[tuple[int, WireItem]] = deque(maxlen=KEPT_ITEMS)
         self._new: deque[tuple[int, WireItem]] = deque(maxlen=KEPT_ITEMS)
         """Items, each with its number, that no page has got yet."""
@@ -77,13 +80,16 @@ class WireTrace:
         self._new.clear()
         return lines, left_out
 
-    def recent(self) -> list[dict[str, Any]]:
-        """Return the latest items, decoded, for a page that subscribes."""
-        decoder = Decoder(self._icd, self._dialect)
-        first = max(0, len(self._kept) - DECODED_PER_TURN)
-        return [
-            {"n": number, **decoder.line(item)} for number, item in itertools.islice(self._kept, first, None)
-        ]
+    def recent(self, start: int) -> list[dict[str, Any]]:
+        """Return the latest items from a number on, decoded, for a page that subscribes; each item is decoded once."""
+        new = min(self._count - self._recent_end, DECODED_PER_TURN)
+        if self._count - self._recent_end > new or not self._recent:
+            self._recent_decoder = Decoder(self._icd, self._dialect)
+        first = max(0, len(self._kept) - new)
+        for number, item in itertools.islice(self._kept, first, None):
+            self._recent.append({"n": number, **self._recent_decoder.line(item)})
+        self._recent_end = self._count
+        return [line for line in self._recent if line["n"] >= start]
 
     def discard(self) -> None:
         """Drop undecoded items, because no page shows the trace."""

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
+import itertools
+from collections import OrderedDict
 from typing import Final, Protocol
 
-QUEUE_LIMIT: Final = 256
+QUEUE_LIMIT: Final = 1000
 """Send-queue limit; the oldest messages are dropped."""
+
+BEHIND: Final = 20
+"""Number of queued messages above which a page gets no trace, and its requests wait."""
 
 
 class Socket(Protocol):
@@ -21,7 +25,9 @@ class Socket(Protocol):
 
 
 class Viewer:
-    """The server side of a page; a page that reads too slowly loses messages but delays nothing.
+    """The server side of a page; a page that reads too slowly loses images and parts of the trace, but delays nothing.
+
+    An image is sent when the page has acknowledged the one before, so that no images are under way over a slow link.
 
     Attributes
     ----------
@@ -33,36 +39,57 @@ class Viewer:
         Telemetry rows that the page shows.
     dropped
         Number of messages and images dropped because the page read too slowly.
+    wire_end, wire_left_out
+        Number of the next item of the trace for the page, and how many it has not got since the last one.
     """
 
     def __init__(self, socket: Socket, *, commands: bool = True) -> None:
         self._socket = socket
         self.commands = commands
-        self._texts: deque[str] = deque()
-        self._frame: bytes | None = None
+        self._texts: OrderedDict[str | int, str] = OrderedDict()
+        self._numbers = itertools.count()
+        self._frame: tuple[bytes, str] | None = None
+        self._acknowledged = True
         self._wake = asyncio.Event()
         self.frames = False
         self.wire = False
         self.rows: frozenset[str] = frozenset()
         self.dropped = 0
+        self.wire_end = 0
+        self.wire_left_out = 0
 
     @property
     def waiting(self) -> int:
         """Number of queued messages, including an image."""
         return len(self._texts) + (self._frame is not None)
 
-    def send(self, text: str) -> None:
-        """Queue a message."""
+    @property
+    def behind(self) -> bool:
+        """Whether the page reads more slowly than it is sent messages."""
+        return len(self._texts) > BEHIND
+
+    def send(self, text: str, *, state: str = "") -> None:
+        """Queue a message; if it is a state, it replaces the queued one with its name."""
+        if state:
+            self._texts.pop(state, None)
         if len(self._texts) >= QUEUE_LIMIT:
-            self._texts.popleft()
+            self._texts.popitem(last=False)
             self.dropped += 1
-        self._texts.append(text)
+        self._texts[state or next(self._numbers)] = text
         self._wake.set()
 
-    def send_frame(self, data: bytes) -> None:
-        """Queue an image, replacing one that is still queued."""
-        self.dropped += self._frame is not None
-        self._frame = data
+    def send_frame(self, data: bytes, numbers: str = "") -> None:
+        """Queue an image; one that is still queued is dropped, and only its numbers are sent, a message."""
+        if self._frame is not None:
+            self.dropped += 1
+            if self._frame[1]:
+                self.send(self._frame[1])
+        self._frame = data, numbers
+        self._wake.set()
+
+    def acknowledge(self) -> None:
+        """Note that the page has received the last image."""
+        self._acknowledged = True
         self._wake.set()
 
     async def pump(self) -> None:
@@ -78,7 +105,7 @@ class Viewer:
             await self.flush()
 
     async def flush(self) -> None:
-        """Send all queued messages.
+        """Send all queued messages, and the image if the page has acknowledged the last one.
 
         Raises
         ------
@@ -87,7 +114,8 @@ class Viewer:
         """
         self._wake.clear()
         while self._texts:
-            await self._socket.send_str(self._texts.popleft())
-        frame, self._frame = self._frame, None
-        if frame is not None:
-            await self._socket.send_bytes(frame)
+            _, text = self._texts.popitem(last=False)
+            await self._socket.send_str(text)
+        if self._frame is not None and self._acknowledged:
+            (data, _), self._frame, self._acknowledged = self._frame, None, False
+            await self._socket.send_bytes(data)

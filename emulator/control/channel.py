@@ -15,7 +15,6 @@ docs/control.md lists the requests.
 from __future__ import annotations
 
 import asyncio
-import hmac
 import json
 import logging
 from collections import deque
@@ -29,12 +28,13 @@ from pydantic import BaseModel, ValidationError
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.control.socket import ControlSocket, automatic_path
+from starhil.emulator.control.token import is_token
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.guard import until_cancelled
 from starhil.emulator.head import Head
-from starhil.emulator.json_lines import RepeatedKeyError, parse_json, read_lines
+from starhil.emulator.json_lines import JsonError, parse_object, read_lines
 from starhil.emulator.pipeline.messages import as_quaternion
 from starhil.emulator.run import Run
 from starhil.emulator.truth.config import TruthConfig
@@ -96,7 +96,6 @@ class ControlServer:
             self._server = await asyncio.start_unix_server(
                 until_cancelled(self._serve_connection),
                 sock=self._socket.socket,
-                limit=MAX_LINE - 1,
                 backlog=self._limit.size,
             )
             return f"unix:{path}"
@@ -106,9 +105,7 @@ class ControlServer:
         what = f"control channel {where}: cannot listen"
         with explained(what, "choose another port, or auto", errors=(OSError, ValueError)):
             serve = until_cancelled(self._serve_connection)
-            self._server = await asyncio.start_server(
-                serve, host, int(port), limit=MAX_LINE - 1, backlog=self._limit.size
-            )
+            self._server = await asyncio.start_server(serve, host, int(port), backlog=self._limit.size)
         address = self._server.sockets[0].getsockname()
         return f"{address[0]}:{address[1]}"
 
@@ -126,10 +123,9 @@ class ControlServer:
             return
         self._writers.add(writer)
         try:
-            async for line in read_lines(reader, within_s=REQUEST_S):
-                if line is None or line.strip():
-                    writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
-                    await writer.drain()
+            async for line in read_lines(reader, MAX_LINE, within_s=REQUEST_S):
+                writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
+                await writer.drain()
         except ConnectionError as error:
             log.info("control channel: connection lost (%s)", error)
         except TimeoutError:
@@ -143,15 +139,12 @@ class ControlServer:
         if line is None:
             return {"ok": False, "error": f"line too long: at most {MAX_LINE} bytes"}
         try:
-            request = parse_json(line)
-        except RepeatedKeyError as error:
+            request = parse_object(line)
+        except JsonError as error:
             return {"ok": False, "error": str(error)}
-        except (ValueError, RecursionError):
-            request = None
-        if not isinstance(request, dict):
-            return {"ok": False, "error": "not a JSON object on one line"}
         identity = {"id": request.pop("id")} if "id" in request else {}
-        if not self._token_is_valid(request.pop("token", None)):
+        token = request.pop("token", None)
+        if self._token and not is_token(token, self._token):
             return {
                 **identity,
                 "ok": False,
@@ -179,11 +172,6 @@ class ControlServer:
             log.exception("control channel: %s", wanted)
             name = type(error).__name__
             return {"ok": False, "error": f"internal error: {name}; see the emulator's log"}
-
-    def _token_is_valid(self, token: object) -> bool:
-        if not self._token:
-            return True
-        return isinstance(token, str) and hmac.compare_digest(token.encode(), self._token.encode())
 
     def _head(self, request: dict[str, Any]) -> Head:
         """Return the head that a request selects."""

@@ -7,6 +7,7 @@ import os
 import socket
 import stat
 import tempfile
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -15,6 +16,10 @@ from starhil.emulator.symlink_lock import LockError, lock_name
 
 PRIVATE_FOLDER: Final = 0o700
 PRIVATE_SOCKET: Final = 0o600
+PREFIX: Final = "control-"
+"""Begin of the name of a default socket, before the process ID."""
+MAX_STALE: Final = 1000
+"""Number of sockets of killed emulators that a start removes."""
 
 
 class ControlSocket:
@@ -25,7 +30,7 @@ class ControlSocket:
             raise EmulatorError(f"--control unix:{path}: must be an absolute path without spaces")
         self.path = path
         try:
-            self._lock = lock_name("control", os.fsencode(path.parent.resolve() / path.name))
+            self._lock = _lock(path)
         except LockError as error:
             raise EmulatorError(f"control channel unix:{path}: {error}; choose another path") from None
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -33,7 +38,7 @@ class ControlSocket:
         what = f"control channel unix:{path}: cannot listen"
         try:
             with explained(what, "choose another path", errors=(OSError, ValueError)):
-                self._remove_stale()
+                _remove_stale(path)
                 self.socket.bind(str(path))
                 path.chmod(PRIVATE_SOCKET)  # no client can connect before it listens
                 self._file = path.lstat()
@@ -41,27 +46,6 @@ class ControlSocket:
         except EmulatorError:
             self.close()
             raise
-
-    def _remove_stale(self) -> None:
-        """Remove the socket that a killed emulator left behind."""
-        try:
-            mode = self.path.lstat().st_mode
-        except FileNotFoundError:
-            return
-        if not stat.S_ISSOCK(mode):
-            raise EmulatorError(f"control channel unix:{self.path}: is not a socket; choose another path")
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-            probe.setblocking(False)  # noqa: FBT003 (the call of the library)
-            try:
-                probe.connect(str(self.path))
-            except ConnectionRefusedError:
-                self.path.unlink()
-                return
-            except BlockingIOError:
-                pass  # another program listens, and is busy
-        raise EmulatorError(
-            f"control channel unix:{self.path}: in use by another program; choose another path"
-        )
 
     def close(self) -> None:
         """Stop listening, and remove the file if it still belongs to this socket."""
@@ -75,7 +59,7 @@ class ControlSocket:
 
 
 def automatic_path() -> Path:
-    """Return the default socket path of this process, in a folder private to its user."""
+    """Return the default socket path of this process, in a folder private to its user; remove those of killed emulators."""
     base = Path(os.environ.get("XDG_RUNTIME_DIR") or "/nonexistent")
     if _is_own_folder(base):
         folder = base / "starhil"
@@ -88,7 +72,37 @@ def automatic_path() -> Path:
                 f"control channel: {folder} belongs to another user; give --control unix:/PATH"
             )
         folder.chmod(PRIVATE_FOLDER)
-    return folder / f"control-{os.getpid()}"
+    for path in islice(folder.glob(f"{PREFIX}*"), MAX_STALE):
+        with (
+            contextlib.suppress(OSError, EmulatorError),
+            _lock(path),
+        ):  # whoever has the lock is about to listen
+            _remove_stale(path)
+    return folder / f"{PREFIX}{os.getpid()}"
+
+
+def _lock(path: Path) -> socket.socket:
+    return lock_name("control", os.fsencode(path.parent.resolve() / path.name))
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove the socket that a killed emulator left behind; EmulatorError if a path is something else."""
+    try:
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise EmulatorError(f"control channel unix:{path}: is not a socket; choose another path")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)  # noqa: FBT003 (the call of the library)
+        try:
+            probe.connect(str(path))
+        except ConnectionRefusedError:
+            path.unlink()
+            return
+        except BlockingIOError:
+            pass  # another program listens, and is busy
+    raise EmulatorError(f"control channel unix:{path}: in use by another program; choose another path")
 
 
 def _is_own_folder(folder: Path) -> bool:

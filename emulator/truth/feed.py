@@ -128,7 +128,6 @@ class LiveFeed:
                     until_cancelled(self._serve_connection),
                     host,
                     port,
-                    limit=self.truth.format.max_size,
                     backlog=self._limit.size,
                 )
                 address = self._server.sockets[0].getsockname()
@@ -156,7 +155,7 @@ class LiveFeed:
         reported = False
         while True:
             try:
-                reader, writer = await asyncio.open_connection(host, port, limit=self.truth.format.max_size)
+                reader, writer = await asyncio.open_connection(host, port)
             except (OSError, ValueError) as error:
                 if not reported:  # once, not at every attempt
                     log.warning(
@@ -176,10 +175,10 @@ class LiveFeed:
             return
         self._writers.add(writer)
         try:
-            async for data in read_lines(reader, self.truth.format.end):
+            async for data in read_lines(reader, self.truth.format.max_size, self.truth.format.end):
                 if data is None:
                     self.truth.reject(f"message longer than {self.truth.format.max_size} bytes")
-                elif data.strip():
+                else:
                     await self._answer(data, writer)
         except ConnectionError:
             self.truth.reject("connection broken")

@@ -29,7 +29,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from starhil.emulator.json_lines import RepeatedKeyError, parse_json
+from starhil.emulator.json_lines import JsonError, parse_object
 from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import MAX_RATE_DEG_S, Vector
@@ -75,13 +75,9 @@ class JsonFormat:
     def decode(self, data: bytes | str) -> FeedMessage:
         """Decode one line; FeedError names the key that is invalid."""
         try:
-            message: Any = parse_json(data)
-        except RepeatedKeyError as error:
+            message = parse_object(data)
+        except JsonError as error:
             raise FeedError(str(error)) from None
-        except (ValueError, RecursionError):
-            raise FeedError("not a JSON line") from None
-        if not isinstance(message, dict):
-            raise FeedError("not a JSON object")
         unknown = sorted(set(message) - set(KEYS))
         if unknown:
             raise FeedError(f"unknown key {unknown[0]!r}; known: {', '.join(KEYS)}")

@@ -32,7 +32,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections import ChainMap
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
@@ -45,9 +44,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal
 from starhil.hil_tests.conformance.link_probe import LinkProbe
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.errors import reason
 from starhil.protocol.names import did_you_mean
-from starhil.protocol.user_file import read_user_text
+from starhil.protocol.user_file import TomlError, read_user_toml
 from starhil.protocol.validation_messages import problems
 
 CUBESPACE_CASES: Final = Path(__file__).with_name("cubespace_cases.toml")
@@ -104,12 +102,14 @@ def _read(path: Path) -> CaseFile:
     Raises BenchError: it is not one; the text names all errors.
     """
     try:
-        document = tomllib.loads(read_user_text(path))
+        document = read_user_toml(path)
         return CaseFile.model_validate(document)
     except ValidationError as error:
         raise BenchError(*(f"{path}: {item}" for item in problems(error, CaseFile, document))) from None
-    except (OSError, ValueError) as error:
-        raise BenchError(f"{path}: {reason(error)}") from None
+    except OSError as error:
+        raise BenchError(f"{path}: cannot be read: {error.strerror}") from None
+    except TomlError as error:
+        raise BenchError(f"{path}: not valid TOML: {error}") from None
 
 
 def _steps(lines: str) -> list[str]:

@@ -83,6 +83,10 @@ class Transport(ABC, Generic[Item]):
     async def close(self) -> None:
         """Close the port; may be called twice."""
 
+    def stop_receiving(self) -> None:
+        """Drop whatever arrives from now on, before the port is closed."""
+        self._on_receive = self.listener = None
+
     def _receive(self, item: Item) -> None:
         if self.listener is not None:
             self.listener(item)

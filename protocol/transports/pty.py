@@ -130,6 +130,8 @@ class PtyTransport(PacedTransport):
         self._path = ""
         self._master = -1
         self._peers: PtyPeers | None = None
+        self._next_read: asyncio.Handle | None = None
+        """The next read, scheduled while data is waiting."""
 
     async def _open(self) -> None:
         try:
@@ -154,7 +156,7 @@ class PtyTransport(PacedTransport):
             os.close(slave)  # the master reports a hang-up while no peer has it open
         self.description = str(self._symlink) if self._symlink is not None else self._path
         self._peers = PtyPeers(self._master, self._path)
-        asyncio.get_running_loop().add_reader(self._peers.fileno(), self._readable)
+        asyncio.get_running_loop().add_reader(self._peers.fileno(), self._woken)
 
     def _make_symlink(self, link: Path, path: str) -> None:
         try:
@@ -166,10 +168,18 @@ class PtyTransport(PacedTransport):
         except OSError as error:
             raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
 
+    def _woken(self) -> None:
+        """Note a wake-up; each write of a peer causes one, and stands for all waiting data."""
+        if self._peers is not None:
+            self._peers.acknowledge()
+            if self._next_read is None:
+                self._readable()
+
     def _readable(self) -> None:
+        """Read once per turn of the loop while data is waiting, however often the peer writes."""
+        self._next_read = None
         if self._peers is None:
             return
-        self._peers.acknowledge()
         self._drop_unread(self._peers)
         try:
             data = os.read(self._master, TURN)
@@ -179,7 +189,7 @@ class PtyTransport(PacedTransport):
             if error.errno != errno.EIO:  # EIO: no peer has the slave side open
                 self._report_error(f"serial {self.description}: {error.strerror}")
             return
-        asyncio.get_running_loop().call_soon(self._readable)  # one wake-up stands for all waiting data
+        self._next_read = asyncio.get_running_loop().call_soon(self._readable)
         self._process_received(data)
 
     def _drop_unread(self, peers: PtyPeers) -> bool:

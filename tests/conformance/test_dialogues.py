@@ -154,7 +154,7 @@ def test_an_error_in_a_file_is_located(old: str, new: str, fault: str, tmp_path:
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    with pytest.raises(BenchError, match=r"none_cases\.toml: No such file"):
+    with pytest.raises(BenchError, match=r"none_cases\.toml: cannot be read: No such file"):
         dialogue_cases(tmp_path / "none_cases.toml")
 
 

@@ -5,11 +5,13 @@ import time
 
 import pytest
 
+from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.errors import EmulatorError
 from tests.emulator.runs import command
 
 LONG_STEP_S = 86_400.0
+REQUEST = bytes.fromhex("1F7FE61FFF")
 
 
 def test_a_step_ends_with_the_run(run):
@@ -24,6 +26,31 @@ def test_a_step_ends_with_the_run(run):
     frames, ended_ns = run(scenario, parameters={"start_mode": "lost_in_space"})
     assert frames > 0
     assert ended_ns < LONG_STEP_S * 1e9
+
+
+def test_nothing_is_received_while_the_run_ends(run, monkeypatch):
+    """Closing takes many turns of the loop, which a storm of requests makes long."""
+    closed = ControlServer.close
+
+    async def scenario(emulation, _line):
+        received = []
+        (link,) = emulation.links
+        with open(emulation.ready_fields["serial"], "r+b", buffering=0) as peer:  # noqa: PTH123
+
+            async def send_and_close(server):
+                monkeypatch.undo()
+                peer.write(REQUEST)
+                for _ in range(10):
+                    await asyncio.sleep(0)
+                received.append(link.transport.statistics.received)
+                received.append(emulation.device.counters.telemetry)
+                closed(server)
+
+            monkeypatch.setattr(ControlServer, "close", send_and_close)
+            await run.launched.close()
+        return received
+
+    assert run(scenario) == [len(REQUEST), 0]
 
 
 def test_no_events_run_while_the_heads_are_closed(run):

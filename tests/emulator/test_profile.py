@@ -231,7 +231,7 @@ def test_overrides_are_toml_or_text():
             "[truth]\nkind = 'slew'\nsegments = [{seconds = 1.0}]\n",
             "do: must be one of 'hold', 'rate', 'slew'",
         ),
-        ("[run\n", "not TOML"),
+        ("[run\n", "not valid TOML"),
         ('extends = "no_such"\n', "no_such"),
         (f'extends = "{"a" * 300}"\n', "File name too long"),
         ("extends = 3\n", "extends"),

@@ -232,7 +232,7 @@ def test_every_scenario_of_the_product_is_valid(name):
         ),
         ("[[at]]\nrun_time_s = 1.0\ntruth = { kind = 'live' }\n", "live feed"),
         ("[[at]]\nrun_time_s = -1.0\nclear_faults = true\n", "run_time_s"),
-        ("[[at", "not TOML"),
+        ("[[at", "not valid TOML"),
     ],
 )
 def test_a_bad_scenario_is_named_with_file_and_key(tmp_path, text, said):

@@ -27,7 +27,7 @@ from tests.protocol.c_driver import COMPILER
 
 HOSTILE = (
     "*/ int x; /*", "/*/ */*", "//", "??/", 'a"b', "it's", "back\\slash\\", "\\", "\\\\", "a\nb", "a\n*/\nb", "a\r\nimport os\r\n",
-    "a\u2028import os\x0bb\x0cc\x85d", "\x00\x01\x1b[31m", "]]>", "<![CDATA[", "<!--", "-->", "<script>alert(1)</script>",
+    "a\u2028import os\x0bb\x0cc\x85d", "\x01\x1b[31m", "]]>", "<![CDATA[", "<!--", "-->", "<script>alert(1)</script>",
     "</title><script>", '" onclick="alert(1)', "`<b>`", "`` <i> `", "`<u>", "[x](javascript:alert(1))", "![x](http://x.invalid/i)",
     "| a | b |", "# heading", "- item", "1. item", "```", "<%= `id` %>", "<%% %>", "<% system('id') -%>", "#{`id`}", "%{x} %s %n",
     "{0} {x} {{", "$(id)", "coding: bogus", "# -*- coding: bogus -*-", "__END__", "=begin\n", "a; b # c", "@MAX_MESSAGE@",

@@ -492,7 +492,7 @@ BAD_DEFINITIONS = [
     ("limit that is too large", HEAD + _row(fields='[{ name = "a", type = "u8", min = -1e300 }]'), "min: a number is at most 1e.100"),
     ("constant that is too large", HEAD + _row(fields='[{ name = "a", type = "u8", const = 1000000000000000000000000000000 }]'), "const"),
     ("offset that is no number", HEAD + _row(fields='[{ name = "a", type = "u8", offset = -nan }]'), "offset: .*finite"),
-    ("default that is too large", HEAD + _row(fields='[{ name = "a", type = "u8", default = 10000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000000 }]'), "default: a number is at most"),
+    ("default that is too large", HEAD + _row(fields='[{ name = "a", type = "u8", default = 1e300 }]'), "default: a number is at most"),
     ("empty list in a map", HEAD + _row(fields='[{ name = "a", type = "u8", map = { 1 = [] } }]'), "map: 1: no value, or a duplicate one"),
     ("value twice in a map", HEAD + _row(fields='[{ name = "a", type = "u8", map = { 1 = ["x", "y"], 2 = "y" } }]'), "map: 2: no value, or a duplicate one"),
     ("default not in the map", HEAD + _row(fields='[{ name = "a", type = "u8", map = { 1 = "x" }, default = "y" }]'), "default 'y' is not in enumeration map"),
@@ -501,6 +501,9 @@ BAD_DEFINITIONS = [
     ("double parameter id", HEAD + '[[parameter]]\nid = 1\nname = "exposure"\n[[parameter]]\nid = 1\nname = "analog_gain"\n', "ID 1 is already used by exposure"),
     ("unit of a parameter", HEAD + '[[parameter]]\nid = 1\nname = "exposure"\nunit = "s"\n', "unit 's', but in the device it is 'ms'"),
     ("limits of a parameter", HEAD + '[[parameter]]\nid = 1\nname = "exposure"\nmin = 9\nmax = 8\n', "needs min and max, with min not above max"),
+    ("too many rows", HEAD + _row("last_id = 4294967295"), "last_id 4294967295 makes 4294967096 rows; a unit has at most 65536"),
+    ("too many rows of several", HEAD + "".join(_row("last_id = 65535", kind="telecommand", identifier=0, name=name) for name in "ab"), "telecommand b: last_id 65535 makes 65536 rows"),
+    ("name of a unit that is too long", HEAD.replace('name = "x"', f'name = "{"u" * 20000}"'), "unit.name: .*at most 100 characters"),
     ("last id", HEAD + _row("last_id = 199"), "last_id 199 is below ID 200"),
     ("argument without action", HEAD + _row(kind="telecommand", identifier=1, fields='[{ name = "a", type = "u8", argument = "mode" }]'), "argument mode: the row has no `action`"),
     ("unknown fixed argument", HEAD + _row('action = "reset"\narguments = { mood = 1 }', kind="telecommand", identifier=1), "action reset has no argument 'mood'"),
@@ -562,4 +565,15 @@ def test_the_definition_may_be_a_folder_or_one_file(tmp_path: Path) -> None:
     file.write_text(text)
     assert [(row.id, row.name, row.size) for row in load_unit(file).rows] == [
         (row.id, row.name, row.size) for row in ROWS
+    ]
+
+
+def test_an_error_of_rows_that_one_entry_expands_to_is_reported_once(tmp_path: Path) -> None:
+    file = tmp_path / "bad.toml"
+    file.write_text(HEAD + _row("last_id = 60000") + _row(identifier=255, name="other"))
+    with pytest.raises(IcdError) as caught:
+        load_unit(file)
+    assert [problem.partition("telemetry ")[2] for problem in caught.value.problems] == [
+        "row_57: ID 256 is above 255",
+        "other: ID 255 is already used by row_56",
     ]

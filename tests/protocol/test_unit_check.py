@@ -160,7 +160,7 @@ def elsewhere(folder: Path, place: str) -> str:
 
 @pytest.mark.parametrize(
     "place",
-    ["../outside.py", "absolute", "sub/unit.py", "sub/../unit.py", "linked/outside.py", "link.py", "loop.py", ".", "..", "", "a\\u0000b"],
+    ["../outside.py", "absolute", "sub/unit.py", "sub/../unit.py", "linked/outside.py", "link.py", "loop.py", ".", "..", ""],
 )  # fmt: skip
 def test_a_plugin_is_a_file_beside_the_definition(tmp_path: Path, place: str) -> None:
     folder = tmp_path / "unit"

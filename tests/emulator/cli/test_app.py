@@ -66,6 +66,11 @@ def test_a_folder_given_as_a_file_is_named(
             "run --canopen 999",
             "run: invalid value for '--canopen': must be at most 127 (see starhil run --help)",
         ),
+        (
+            "conformance --time-out 1e300",
+            "conformance: invalid value for '--time-out': must be at most 1000000",
+        ),
+        ("bench bus --seconds 1e300", "bench bus: invalid value for '--seconds': must be at most 1000000"),
         ("render --ra x", "render: invalid value for '--ra': must be a valid number"),
         ("render", "render: missing option '--ra'"),
         ("icd export nope", "icd export: invalid value for 'FORMAT': 'nope' is not one of 'markdown'"),

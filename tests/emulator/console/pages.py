@@ -24,6 +24,8 @@ class Page:
         self.messages = []
         self.frames = []
         self.history = None
+        self.acknowledges = True
+        self._parts = []
         self._number = 0
 
     def url(self, path):
@@ -54,8 +56,12 @@ class Page:
             middle, end = 9 + sizes[0], 9 + sum(sizes)
             head = json.loads(message.data[9:middle]) | json.loads(message.data[middle:end])
             self.frames.append((head, message.data[end:]))
+            if self.acknowledges:
+                await self.socket.send_str(json.dumps({"do": "received"}))
+        elif message.data[8:]:
+            self._parts.append(np.frombuffer(message.data[8:]).reshape(-1, len(COLUMNS)))
         else:
-            self.history = np.frombuffer(message.data[8:]).reshape(-1, len(COLUMNS))
+            self.history = np.vstack([np.empty((0, len(COLUMNS))), *self._parts])
 
     async def until(self, condition):
         """Receive until a condition holds."""

@@ -6,8 +6,12 @@ import re
 import shutil
 import socket
 import subprocess
+import threading
+import time
 import urllib.error
 import urllib.request
+from contextlib import contextmanager, suppress
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -339,6 +343,68 @@ def test_a_page_that_connects_to_another_run_shows_nothing_of_the_run_before(pag
     )
     assert attitude == ["–", "–", "–", "–"]
     assert image is None
+
+
+SLOW_BYTES_S = 100_000
+"""Rate of a slow link: a third of what images at 5 Hz need."""
+
+
+@contextmanager
+def slow_link(port):
+    """Yield the port of a proxy that passes bytes from a server at `SLOW_BYTES_S`, with small buffers."""
+
+    def pump(source, sink, pause_s):
+        with suppress(OSError):
+            while data := source.recv(2048):
+                sink.sendall(data)
+                time.sleep(len(data) * pause_s)
+        for each in (source, sink):
+            with suppress(OSError):
+                each.shutdown(socket.SHUT_RDWR)
+
+    def serve():
+        with suppress(OSError):
+            while True:
+                client, _ = listener.accept()
+                server = socket.socket()
+                server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8192)
+                server.connect(("127.0.0.1", port))
+                for arguments in ((client, server, 0.0), (server, client, 1.0 / SLOW_BYTES_S)):
+                    threading.Thread(target=pump, args=arguments, daemon=True).start()
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=serve, daemon=True).start()
+        yield listener.getsockname()[1]
+        listener.shutdown(socket.SHUT_RDWR)
+
+
+def test_over_a_slow_link_images_are_left_out_and_numbers_are_not(page, browser, emulator):
+    track(page)
+    port = urlsplit(emulator.ready["view"]).port
+    with slow_link(port) as slow_port:
+        slow = browser.new_page()
+        slow.set_default_timeout(WITHIN_MS)
+        slow.goto(emulator.ready["view"].replace(str(port), str(slow_port)))
+        slow.wait_for_function("() => starhil.store.images.length > 0")
+        begin = slow.evaluate("starhil.store.now")
+        slow.wait_for_function("begin => starhil.store.now > begin + 15", arg=begin)
+        behind_s = page.evaluate("starhil.store.now") - slow.evaluate("starhil.store.images.at(-1).time")
+        numbers = slow.evaluate(
+            """begin => {
+                const { rows } = starhil.store;
+                const found = [];
+                for (let at = rows.start; at < rows.end; at++) if (rows.at(at, "run_s") > begin) found.push(rows.at(at, "frame"));
+                return found;
+            }""",
+            begin,
+        )
+        images = slow.evaluate(
+            "begin => starhil.store.images.filter(each => each.time > begin).length", begin
+        )
+        slow.close()
+    assert numbers == list(range(int(numbers[0]), int(numbers[0]) + len(numbers)))
+    assert 0 < images < len(numbers)
+    assert behind_s < 4.0  # without acknowledgement it grows by two seconds in three
 
 
 def test_a_wrong_token_and_another_origin_get_403(emulator):

@@ -1,6 +1,7 @@
 """The console's server: who may look, what a page receives, pages that do not read, heads, and reports of runs."""
 
 import asyncio
+import json
 import socket
 from contextlib import AsyncExitStack
 from dataclasses import replace
@@ -9,7 +10,10 @@ import aiohttp
 import numpy as np
 import pytest
 
+from starhil.emulator.console import server
+from starhil.emulator.console.console import Console
 from starhil.emulator.console.history import COLUMNS, MODES
+from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
 from starhil.emulator.errors import EmulatorError
 from starhil.hil_tests.errors import BenchError
@@ -339,6 +343,110 @@ def test_a_page_that_does_not_read_keeps_a_bounded_queue_and_the_newest_image():
     asyncio.run(scenario())
 
 
+class KeepingSocket:
+    """Keeps what is sent."""
+
+    def __init__(self):
+        self.sent = []
+
+    async def send_str(self, text):
+        self.sent.append(text)
+
+    async def send_bytes(self, data):
+        self.sent.append(data)
+
+
+def test_an_image_waits_until_the_last_is_acknowledged_and_one_that_is_dropped_leaves_its_numbers():
+    async def scenario():
+        socket_ = KeepingSocket()
+        viewer = Viewer(socket_)
+        for number in range(4):
+            viewer.send_frame(b"image %d" % number, f"numbers {number}")
+            await viewer.flush()
+        assert socket_.sent == [b"image 0", "numbers 1", "numbers 2"]
+        viewer.acknowledge()
+        await viewer.flush()
+        assert socket_.sent[3:] == [b"image 3"]
+
+    asyncio.run(scenario())
+
+
+def test_a_slow_page_gets_only_the_last_of_each_state():
+    async def scenario():
+        socket_ = KeepingSocket()
+        viewer = Viewer(socket_)
+        for number in range(100):
+            viewer.send(f"status {number}", state="status")
+            viewer.send(f"rates {number}", state="telemetry rates")
+        viewer.send("row")
+        await viewer.flush()
+        assert socket_.sent == ["status 99", "rates 99", "row"]
+
+    asyncio.run(scenario())
+
+
+def test_a_page_that_acknowledges_no_image_gets_the_numbers_of_every_frame(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        async with Page(emulation) as page:
+            page.acknowledges = False
+            await page.ask(do="subscribe", frames=True)
+            await emulation.stepper.step(5.0)
+            newest = emulation.device.cycle.published
+            assert newest >= 4
+
+            def numbers():
+                rows = [head["row"] for head, _ in page.frames]
+                rows += [item["row"] for item in page.messages if item["type"] == "row"]
+                return [column(row, "frame") for row in rows]
+
+            await page.until(lambda: len(numbers()) == newest - 1)
+            assert numbers() == list(range(1, newest))
+            assert len(page.frames) == 1
+            await page.socket.send_str(json.dumps({"do": "received"}))
+            await page.until_frame(newest)
+
+    run(scenario, options=OPTIONS)
+
+
+def test_the_requests_of_a_page_come_at_most_so_often(run, monkeypatch):
+    times = []
+    subscribe = Console._subscribe
+
+    async def noted(self, viewer, request):
+        times.append(asyncio.get_running_loop().time())
+        return await subscribe(self, viewer, request)
+
+    monkeypatch.setattr(Console, "_subscribe", noted)
+
+    async def scenario(emulation, _line):
+        async with Page(emulation, field="view_only") as page:
+            for number in range(30):
+                text = json.dumps({"id": number, "do": "subscribe", "wire": number % 2 == 0, "frames": True})
+                await page.socket.send_str(text)
+            await page.message("answer", lambda item: item["id"] == 29)
+
+    run(scenario, options=replace(OPTIONS, view_token="look"))
+    assert len(times) == 30
+    assert min(np.diff(times)) >= server.PAGE_TURN_S
+
+
+def test_a_long_history_is_sent_in_parts_and_a_row_that_comes_meanwhile_is_among_them(run, monkeypatch):
+    monkeypatch.setattr(server, "HISTORY_PART", 3)
+
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        await emulation.stepper.step(5.0)
+        async with Page(emulation) as page:
+            frames = column(page.history.T, "frame")
+            assert len(page.history) > 6
+            assert list(frames[~np.isnan(frames)]) == list(range(1, emulation.device.cycle.published + 1))
+
+    run(scenario, options=OPTIONS)
+
+
 def test_a_session_reports_its_results_to_the_console_as_they_arrive(run):
     async def scenario(emulation, _line):
         address = emulation.ready_fields["view"]
@@ -361,6 +469,44 @@ def test_a_session_reports_its_results_to_the_console_as_they_arrive(run):
             assert [result["name"] for result in report["results"]] == ["the device answers", "it tracks"]
 
     run(scenario, options=OPTIONS)
+
+
+def test_a_result_with_very_much_traffic_is_reported_with_its_last_lines(run):
+    async def scenario(emulation, _line):
+        async with Page(emulation) as page:
+            feed = await asyncio.to_thread(
+                RunFeed, emulation.ready_fields["view"], kind="conformance", title="", unit="", planned=1
+            )
+            lines = tuple(f"-> {number} " + "00 " * 40 for number in range(10_000))
+            feed.result(id="1", name="a case", status="failed", log=lines)
+            shown = (await page.message("result"))["result"]["log"]
+            assert shown == [line[:300] for line in lines[-len(shown) :]]
+            assert len(shown) >= 100
+            await asyncio.to_thread(feed.close)
+            await page.message("run", lambda item: item["end_s"] is not None)
+
+    run(scenario, options=OPTIONS)
+
+
+def test_results_of_any_size_are_kept_in_bounded_memory():
+    """A peer may send 2000 results of a megabyte in each of 20 runs."""
+    runs = Runs()
+    texts = dict.fromkeys(("id", "name", "link", "detail", "unknown"), "x" * 50_000)
+    for name in "ab":
+        runs.report({"event": "begin", "run": name, "planned": 10**400})
+        for number in range(200):
+            log = [*["y" * 100] * 1000, *[""] * 1000, {"z": number}]
+            result = {**texts, "status": "failed", "seconds": 10**400, "log": log}
+            runs.report({"event": "result", "run": name, "result": result})
+    sizes = [len(message) for message in runs.messages()]
+    assert len(sizes) == 2
+    assert max(sizes) < 2_000_000
+    last = json.loads(list(runs.messages())[-1])
+    assert last["counts"]["failed"] == len(last["results"]) == 200
+    assert last["planned"] == 0
+    assert last["results"][-1]["log"][-1] == "{'z': 199}"
+    assert "log" not in last["results"][0]
+    assert "unknown" not in last["results"][0]
 
 
 def test_a_report_to_no_console_is_an_error_in_one_line(run):

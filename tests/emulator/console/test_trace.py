@@ -2,7 +2,8 @@
 
 import pytest
 
-from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
+from starhil.emulator.console.trace import DECODED_PER_TURN, WireTrace
+from starhil.emulator.links.traffic import Decoder, Traffic, WireItem, canopen_text
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
 from starhil.protocol.cubespace import Dialect
 from starhil.protocol.icd import load_unit
@@ -80,3 +81,37 @@ def test_requests_on_can_and_junk_are_distinguished():
 )  # fmt: skip
 def test_frames_of_canopen_are_named_by_their_function(can_id, text):
     assert canopen_text(CanFrame(can_id, extended=False)) == text
+
+
+def test_the_latest_items_are_decoded_once_however_many_pages_ask(monkeypatch):
+    decoded = []
+    line = Decoder.line
+
+    def noted(self, entry):
+        decoded.append(entry)
+        return line(self, entry)
+
+    monkeypatch.setattr(Decoder, "line", noted)
+    traffic = Traffic()
+    trace = WireTrace(load_unit(), traffic, lambda: None, str)
+    trace.listen(wanted=True)
+
+    def pass_by(count):
+        for _ in range(count):
+            traffic.passed.emit(WireItem(0.0, "serial", outgoing=False, item=bytes.fromhex("1F7FE61FFF")))
+
+    pass_by(2)
+    assert [each["n"] for each in trace.recent(0)] == [0, 1]
+    pass_by(3)
+    for _ in range(10):
+        assert [each["n"] for each in trace.recent(0)] == [0, 1, 2, 3, 4]
+        assert [each["n"] for each in trace.recent(3)] == [3, 4]
+    assert len(decoded) == 5
+    pass_by(3 * DECODED_PER_TURN)
+    for _ in range(10):
+        latest = trace.recent(0)
+        assert [each["n"] for each in latest] == list(
+            range(5 + 2 * DECODED_PER_TURN, 5 + 3 * DECODED_PER_TURN)
+        )
+        assert "quaternion?" in latest[-1]["text"]
+    assert len(decoded) == 5 + DECODED_PER_TURN

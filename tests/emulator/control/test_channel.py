@@ -331,7 +331,7 @@ def test_a_live_feed_drives_the_truth(run, protocol):
             while (status := await control.do("status"))["feed"]["refused"] == 0:
                 await asyncio.sleep(0.01)
             assert status["feed"]["accepted"] == 1
-            assert status["feed"]["last_fault"] == "not a JSON line"
+            assert status["feed"]["last_fault"] == "not a JSON object on one line"
             assert (await control.do("truth", run_time_s=0.5))["roll_deg"] >= 0.0
             assert (await control.do("truth", run_time_s=0.5))["status"] == "extrapolated"
             assert (await control.do("truth", run_time_s=9.0))["status"] == "stale"

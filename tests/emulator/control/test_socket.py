@@ -12,8 +12,10 @@ import pytest
 
 from starhil.emulator.control.channel import MAX_LINE
 from starhil.emulator.control.socket import ControlSocket
+from starhil.emulator.control.token import check_token
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
+from starhil.emulator.symlink_lock import lock_name
 from tests.emulator.runs import Control
 
 
@@ -80,6 +82,29 @@ def test_a_socket_that_a_killed_emulator_left_is_replaced(run, tmp_path):
     assert not path.exists()
 
 
+def test_default_sockets_of_killed_emulators_are_removed_and_others_are_left(run, runtime_folder):
+    folder = runtime_folder / "starhil"
+    folder.mkdir(mode=0o700)
+    (folder / "control-text").write_text("of great worth")
+    for name in ("control-1", "control-2", "other-1"):
+        with socket.socket(socket.AF_UNIX) as dead:
+            dead.bind(str(folder / name))
+    with (
+        socket.socket(socket.AF_UNIX) as listening,
+        socket.socket(socket.AF_UNIX) as starting,
+        lock_name("control", os.fsencode(folder / "control-4")),
+    ):
+        listening.bind(str(folder / "control-3"))
+        listening.listen()
+        starting.bind(str(folder / "control-4"))
+
+        async def scenario(emulation, _line):
+            return {path.name for path in folder.iterdir()}
+
+        found = run(scenario)
+    assert found == {"control-3", "control-4", "control-text", "other-1", f"control-{os.getpid()}"}
+
+
 def test_a_path_in_use_is_rejected_and_left_alone(run, tmp_path):
     path, text = tmp_path / "control", tmp_path / "text"
     text.write_text("of great worth")
@@ -123,7 +148,14 @@ def test_a_path_that_cannot_be_is_rejected_in_one_line(run, path, said):
 def test_with_a_token_nothing_is_done_without_it(run, control):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
-            for wrong in ({}, {"token": ""}, {"token": "sesam"}, {"token": 3}, {"token": None}):
+            for wrong in (
+                {},
+                {"token": ""},
+                {"token": "sesam"},
+                {"token": 3},
+                {"token": None},
+                {"token": "\ud800"},
+            ):
                 answer = await control.do("quit", id=7, **wrong)
                 assert answer == {
                     "id": 7,
@@ -184,3 +216,9 @@ def test_no_answer_quotes_a_file(run, tmp_path):
             assert "s3cr3t" not in answer["error"]
 
     run(scenario)
+
+
+@pytest.mark.parametrize("token", ["", "a\nb", "\udcff"])
+def test_a_token_that_cannot_stand_in_an_address_is_rejected(token):
+    with pytest.raises(EmulatorError, match="--view-token: must be a text that can be printed"):
+        check_token("--view-token", token)

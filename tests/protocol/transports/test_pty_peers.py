@@ -164,3 +164,30 @@ def test_no_descriptor_stays_open_after_close() -> None:
         assert len(list(Path("/proc/self/fd").iterdir())) == before
 
     asyncio.run(main())
+
+
+def test_a_peer_that_writes_all_the_time_is_read_once_per_turn_of_the_loop() -> None:
+    """Each of its writes wakes the transport; more and more reads per turn left no time for anything else."""
+    reads, count = 0, 500
+
+    async def main() -> None:
+        port = open_serial("auto", paced=False)
+        peer = -1
+
+        def write_again(_data: bytes) -> None:
+            nonlocal reads
+            reads += 1
+            os.write(peer, b"x")
+
+        await port.start(write_again)
+        peer = os.open(port.description, os.O_RDWR | os.O_NOCTTY)
+        try:
+            os.write(peer, b"x")
+            for _ in range(count):
+                await asyncio.sleep(0)
+        finally:
+            await port.close()
+            os.close(peer)
+
+    asyncio.run(main())
+    assert count / 2 < reads <= count + 1

@@ -72,6 +72,7 @@ export class Link {
       const head = { ...parse(9, numbers), ...parse(9 + numbers, overlay) };
       const image = new Uint8Array(data, 9 + numbers + overlay);
       this.handlers.frame(head, image.length ? new Blob([image], { type: "image/jpeg" }) : null);
+      this.socket.send('{"do": "received"}'); // the next image comes then
     } else {
       this.handlers.history(new Float64Array(data, 8));
     }
