@@ -7,6 +7,8 @@ import json
 from collections.abc import AsyncIterator
 from typing import Any
 
+from starhil.protocol.errors import shortened
+
 
 class RepeatedKeyError(ValueError):
     """An object has a key twice, so its value is ambiguous."""
@@ -18,11 +20,13 @@ def parse_json(line: bytes | str) -> Any:
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in values:
-            raise RepeatedKeyError(f"key {key!r} is repeated")
-        values[key] = value
+    values = dict(pairs)
+    if len(values) < len(pairs):
+        seen: set[str] = set()
+        for key, _ in pairs:
+            if key in seen:
+                raise RepeatedKeyError(f"key {shortened(repr(key))} is repeated")
+            seen.add(key)
     return values
 
 
