@@ -276,12 +276,12 @@ def _problems_of_keys(
 
     The rest of a table with many problems is not checked.
     """
-    found = 0
-    for number, (key, value) in enumerate(table.items() if isinstance(table, dict) else ()):
+    found, keys = 0, table if isinstance(table, dict) else {}
+    for number, (key, value) in enumerate(keys.items()):
         if found >= MAX_PROBLEMS - 1:
             yield (
                 (section,),
-                f"{section}: {len(table) - number} more keys are not checked; correct these first",
+                f"{section}: {len(keys) - number} more keys are not checked; correct these first",
             )
             return
         try:

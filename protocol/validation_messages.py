@@ -88,11 +88,10 @@ def problems(
     above: set[tuple[int | str, ...]] = set()
     items = error.errors(include_url=False)
     for item in items[:most]:
-        unknown = (
-            item["type"] == "extra_forbidden"
-        )  # _along would drop the key if it is also the tag of an alternative
+        unknown = item["type"] == "extra_forbidden"
+        # without an unknown key, which _along would drop if it is also the tag of an alternative
         location, models = _along(model, item["loc"][: -1 if unknown else None])
-        say = partial(_texts, item)
+        say: Callable[[bool], list[str]] = partial(_texts, item)
         if unknown:
             key = str(item["loc"][-1])
             say = partial(_unknown_key, key, models, hints or {}, () if location else also)

@@ -40,7 +40,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import urlsplit
 
-from aiohttp import ClientSession
+from aiohttp import ClientSession, ClientWebSocketResponse
 
 from starhil.hil_tests.bench import LinkOptions
 from starhil.hil_tests.client import ObcClient
@@ -319,18 +319,34 @@ def polled_ms(obc: ObcClient, rng: random.Random) -> list[float]:
     return taken
 
 
-async def ask_page(view: str, requests: Sequence[dict[str, Any]]) -> None:
-    """Send requests as a page of the console, and wait for their answers."""
-    page = urlsplit(view)
-    async with (
-        ClientSession() as session,
-        session.ws_connect(f"http://{page.netloc}/ws?{page.query}", max_msg_size=0) as pages,
-    ):
-        for number, request in enumerate(requests):
-            await pages.send_str(json.dumps({**request, "id": number}))
-            async for message in pages:  # ends if the console closes
-                if f'"id": {number}' in str(message.data)[:60]:
-                    break
+class Page:
+    """A page of the console, which stays open."""
+
+    def __init__(self, view: str, stack: ExitStack) -> None:
+        page = urlsplit(view)
+        self._runner = stack.enter_context(asyncio.Runner())
+        session = self._runner.run(self._open())
+        stack.callback(lambda: self._runner.run(session.close()))
+        address = f"http://{page.netloc}/ws?{page.query}"
+        self._pages = self._runner.run(self._connect(session, address))
+
+    @staticmethod
+    async def _open() -> ClientSession:
+        return ClientSession()
+
+    @staticmethod
+    async def _connect(session: ClientSession, address: str) -> ClientWebSocketResponse:
+        return await session.ws_connect(address, max_msg_size=0)
+
+    def ask(self, request: dict[str, Any]) -> None:
+        """Send a request and wait for its answer."""
+        self._runner.run(self._ask(request))
+
+    async def _ask(self, request: dict[str, Any]) -> None:
+        await self._pages.send_str(json.dumps({**request, "id": 1}))
+        async for message in self._pages:  # ends if the console closes
+            if '"type": "answer"' in str(message.data)[:60]:
+                return
 
 
 class Attack:
@@ -339,6 +355,7 @@ class Attack:
     def __init__(self, emulator: EmulatorProcess, stack: ExitStack) -> None:
         self._ready = emulator.ready
         self._turn = 0
+        self._page = Page(self._ready["view"], stack)
         self._control = stack.enter_context(ControlClient(self._ready["control"]))
         self._feed = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         host, _, port = self._ready["can"].removeprefix("socketcand:").partition("/")[0].partition(":")
@@ -348,6 +365,7 @@ class Attack:
             "control": self._to_control,
             "console": self._to_console,
             "feed": self._to_feed,
+            "serial": self._to_serial,
             "hub": lambda: self._hub.sendall(b"< send 1234567 8 1 2 3 4 5 6 7 > <" * (WORST_BYTES // 35)),
             "CAN": lambda: self._hub.sendall(b"< send 07030104 8 1 2 3 4 5 6 7 9 >" * (WORST_BYTES // 35)),
         }
@@ -364,15 +382,22 @@ class Attack:
     def _to_console(self) -> None:
         request = self._next(worst_requests())
         wanted = [{"do": "control", "request": request}, {"do": "encode", "row": "a" * (WORST_BYTES - 99)}]
-        asyncio.run(ask_page(self._ready["view"], [wanted[self._turn % 2]]))
+        self._page.ask(wanted[self._turn % 2])
+
+    def _to_serial(self) -> None:
+        with Path(self._ready["serial"]).open("wb", buffering=0) as line:
+            line.write(b"\x1f\x7f\x80" * (WORST_BYTES // 3))
 
     def _to_feed(self) -> None:
         host, _, port = self._ready["truth"].removeprefix("udp:").rpartition(":")
         self._feed.sendto(self._next(worst_datagrams()), (host, int(port)))
 
 
-def worst() -> bool:
-    """Print the p99 of replies on the serial line with and without the worst messages of each channel; return whether all is well."""
+def worst(wanted: Sequence[str]) -> bool:
+    """Print the p99 of replies with and without the worst messages of each channel; return whether all is well.
+
+    The OBC polls on the serial line, and on CAN while the serial line gets the messages.
+    """
     good, rng = True, random.Random(1)  # noqa: S311 (rows to request, not secrets)
     with ExitStack() as stack:
         hub = stack.enter_context(EmulatorProcess(hub_command()))
@@ -385,11 +410,14 @@ def worst() -> bool:
         )
         emulator = stack.enter_context(EmulatorProcess(command))
         attack = Attack(emulator, stack)
-        obc = stack.enter_context(
-            ObcClient.open(serial=emulator.ready["serial"], baud=BAUD, timeout_s=SETTLE_S)
-        )
-        polled_ms(obc, rng)  # warm up
+        on_serial = ObcClient.open(serial=emulator.ready["serial"], baud=BAUD, timeout_s=SETTLE_S)
+        on_can = ObcClient.open(can=emulator.ready["can"], timeout_s=SETTLE_S)
+        for obc in (on_serial, on_can):
+            polled_ms(stack.enter_context(obc), rng)  # warm up
         for name, send in attack.channels.items():
+            if wanted and name not in wanted:
+                continue
+            obc = on_can if name == "serial" else on_serial
             without: list[float] = []
             with_messages: list[float] = []
             for _ in range(WORST_WINDOWS):
@@ -411,11 +439,13 @@ def main() -> int:
     """Run the soak test and print the result; return 0 if nothing grew."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=15.0, help="how long")
-    parser.add_argument("--worst", action="store_true", help="the worst messages of each channel instead")
+    parser.add_argument(
+        "--worst", nargs="*", metavar="CHANNEL", help="the worst messages of each channel instead"
+    )
     options = parser.parse_args()
     try:
-        if options.worst:
-            return int(not worst())
+        if options.worst is not None:
+            return int(not worst(options.worst))
         figures = compare(soak(60.0 * options.minutes))
     except (BenchError, ValueError) as error:
         print(f"soak: {error}", file=sys.stderr)

@@ -54,6 +54,9 @@ SMALL, LARGE = 4_000, 32_000
 GROWTH = 2.0
 """Largest growth of the work per byte, from the small to the large message; quadratic work would grow by 8."""
 
+FIXED_S = 1e-3
+"""Processor time that a message may need whatever its size, seconds."""
+
 FIXED_WORK = 10_000
 """Calls that a message may need whatever its size."""
 
