@@ -8,11 +8,10 @@ import math
 from collections.abc import AsyncIterator
 from typing import Any, Final
 
+from starhil.protocol.errors import shortened
+
 TURN: Final = 4096
 """Maximum number of bytes read before other tasks run."""
-
-QUOTED: Final = 100
-"""Longest part of a key that an error quotes, characters."""
 
 
 class JsonError(ValueError):
@@ -39,10 +38,10 @@ def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for key, value in pairs:
         if key in values:
-            raise JsonError(f"key {key[:QUOTED]!r} is repeated")
+            raise JsonError(f"key {shortened(repr(key))} is repeated")
         wrong = _not_finite(value)
         if wrong is not None:
-            raise JsonError(f"{key[:QUOTED]}: {wrong!r} is not a finite number")
+            raise JsonError(f"{shortened(key)}: {wrong!r} is not a finite number")
         values[key] = value
     return values
 

@@ -41,7 +41,7 @@ from starhil.emulator.truth.config import (
     TruthConfig,
     UserPath,
 )
-from starhil.protocol.errors import IcdError, ProtocolError
+from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import DEFAULT_UNIT, bundled_units, find, not_found, remedy
 from starhil.protocol.user_file import TomlError, parse_toml
@@ -272,12 +272,23 @@ def _path_of_unit(name: str, folder: Path) -> Path | None:
 def _problems_of_keys(
     section: str, table: object, check: Callable[[dict[str, Any]], object]
 ) -> Iterator[tuple[Sequence[object], str]]:
-    """Yield location and text of the problems of a table, each key of which is checked alone."""
-    for key, value in table.items() if isinstance(table, dict) else ():
+    """Yield location and text of the problems of a table, each key of which is checked alone.
+
+    The rest of a table with many problems is not checked.
+    """
+    found, keys = 0, table if isinstance(table, dict) else {}
+    for number, (key, value) in enumerate(keys.items()):
+        if found >= MAX_PROBLEMS - 1:
+            yield (
+                (section,),
+                f"{section}: {len(keys) - number} more keys are not checked; correct these first",
+            )
+            return
         try:
             check({key: value})
         except (EmulatorError, ProtocolError) as error:
             yield from (((section, key), text) for text in error.problems)
+            found += 1
 
 
 def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) -> None:

@@ -15,6 +15,7 @@ from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.expect import Keys, StatedAttitude
 from starhil.hil_tests.steps import ACTIONS, FileName, Link, Step, Texts, Timeout
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.errors import MAX_PROBLEMS
 from starhil.protocol.names import did_you_mean
 from starhil.protocol.user_file import TomlError, read_user_toml
 from starhil.protocol.validation_messages import problems
@@ -101,6 +102,10 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         wrong += found
         names = table.get("capture")
         captured.update(names if isinstance(names, dict) else ())  # also of a step with an error
+        if len(wrong) >= MAX_PROBLEMS and number < len(tables):
+            rest = f"{path.name}: {len(tables) - number} more steps are not checked; correct these first"
+            wrong.insert(MAX_PROBLEMS - 1, rest)
+            break
     if wrong or script is None:
         raise ScriptError(*wrong)
     return script.model_copy(update={"steps": tuple(steps)})

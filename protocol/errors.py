@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 import os
+from typing import Final
+
+MAX_PROBLEMS: Final = 20
+"""Number of problems that an error shows; of further ones it gives the number."""
+
+LONGEST_PROBLEM: Final = 2000
+"""Length of the text of a problem, which may quote what a peer has sent; longer text loses its middle."""
 
 
 class OneLineError(Exception):
@@ -10,8 +17,13 @@ class OneLineError(Exception):
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """The problems, each one line that names what and where; controls in what they quote are escaped."""
-        return tuple(escape_controls(str(problem)) for problem in self.args)
+        """The problems, each one line that names what and where; controls in what they quote are escaped.
+
+        At most `MAX_PROBLEMS`, and then the number of further ones.
+        """
+        shown = tuple(escape_controls(shortened(str(problem))) for problem in self.args[:MAX_PROBLEMS])
+        more = len(self.args) - len(shown)
+        return (*shown, f"and {more} more") if more else shown
 
     def __str__(self) -> str:
         return "; ".join(self.problems)
@@ -35,6 +47,12 @@ def reason(error: Exception) -> str:
     if isinstance(number, int) and number > 0:
         return os.strerror(number)
     return getattr(error, "strerror", None) or str(error) or type(error).__name__
+
+
+def shortened(text: str) -> str:
+    """Return text without its middle if it is longer than `LONGEST_PROBLEM`; a problem ends with its remedy."""
+    half = LONGEST_PROBLEM // 2
+    return text if len(text) <= LONGEST_PROBLEM else f"{text[:half]} … {text[-half:]}"
 
 
 def escape_controls(text: str) -> str:

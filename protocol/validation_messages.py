@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache, partial
+from itertools import repeat
 from typing import Any, Final, Literal, NamedTuple, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from starhil.protocol.errors import MAX_PROBLEMS
 from starhil.protocol.names import did_you_mean, remedy
 
 _NEEDED: Final = {
@@ -63,8 +66,11 @@ def problems(
     *,
     hints: Mapping[str, str] | None = None,
     also: Sequence[str] = (),
+    most: int | None = None,
 ) -> Iterator[Problem]:
     """Yield all errors of a document that is not valid for a model.
+
+    Only the first `MAX_PROBLEMS` suggest similar names, because an error shows no more of them.
 
     Parameters
     ----------
@@ -74,42 +80,59 @@ def problems(
         Remedies for unknown keys, instead of the known keys.
     also:
         Further keys allowed at the top level.
+    most:
+        Number of errors that are examined, at least `MAX_PROBLEMS`; for each further one there is an empty problem.
+        Default: all.
     """
-    found: dict[tuple[int | str, ...], tuple[str, list[Problem]]] = {}
-    for item in error.errors(include_url=False):
-        location, models = _along(model, item["loc"])
+    found: dict[tuple[int | str, ...], tuple[ErrorDetails, Callable[[bool], list[str]]]] = {}
+    above: set[tuple[int | str, ...]] = set()
+    items = error.errors(include_url=False)
+    for item in items[:most]:
         unknown = item["type"] == "extra_forbidden"
+        # without an unknown key, which _along would drop if it is also the tag of an alternative
+        location, models = _along(model, item["loc"][: -1 if unknown else None])
+        say: Callable[[bool], list[str]] = partial(_texts, item)
         if unknown:
-            location, models = _along(model, item["loc"][:-1])
-            key = str(item["loc"][-1])  # _along would drop it if it is also the tag of an alternative
-            known = sorted({*(key for each in models for key in _keys_of(each)), *(() if location else also)})
-            hint = (hints or {}).get(key) or remedy(key, known)
-            location, texts = (*location, key), [f"unknown key{hint}"]
+            key = str(item["loc"][-1])
+            say = partial(_unknown_key, key, models, hints or {}, () if location else also)
+            location = (*location, key)
         elif item["type"] in _UNIONS:
             location = (*location, str(item["ctx"]["discriminator"]).strip("'"))
-            texts = [_choice(item, models)]
-        else:
-            texts = _texts(item)
+            say = partial(_choice, item, models)
         if document is not None:
             location = _in(document, location, absent=item["type"] in _ABSENT)
-        if location not in found:  # an alternative of a union that has been reported
-            key = _dotted(document, location)
-            found[location] = item["type"], [Problem(location, key, text, unknown) for text in texts]
-    for location, (kind, said) in found.items():
-        below = any(other != location and other[: len(location)] == location for other in found)
-        if not (kind in _NEEDED and below):  # another alternative has the right type, and errors in it
-            yield from said
+        found.setdefault(location, (item, say))  # an alternative of a union may have been reported
+        above.update(location[:count] for count in range(len(location)))
+    written = 0
+    for location, (item, say) in found.items():
+        if item["type"] in _NEEDED and location in above:
+            continue  # another alternative has the right type, and errors in it
+        key = _dotted(document, location)
+        for text in say(written < MAX_PROBLEMS):
+            yield Problem(location, key, text, item["type"] == "extra_forbidden")
+            written += 1
+    yield from repeat(Problem((), "", ""), len(items) - len(items[:most]))
 
 
-def _texts(item: ErrorDetails) -> list[str]:
+def _unknown_key(
+    key: str, models: Sequence[type[BaseModel]], hints: Mapping[str, str], also: Sequence[str], suggest: bool
+) -> list[str]:
+    """Return the text of a key that none of the models has."""
+    if not suggest:
+        return ["unknown key"]
+    known = {*(key for each in models for key in _keys_of(each)), *also}
+    return [f"unknown key{hints.get(key) or remedy(key, known)}"]
+
+
+def _texts(item: ErrorDetails, suggest: bool) -> list[str]:
     """Return what an error says: one text, or those of a validator that has found several problems."""
     raised = item.get("ctx", {}).get("error")
     if isinstance(raised, ValueError) and len(raised.args) > 1:
         return [str(text) for text in raised.args]
-    return [wording(item)]
+    return [wording(item, suggest=suggest)]
 
 
-def wording(item: ErrorDetails) -> str:
+def wording(item: ErrorDetails, *, suggest: bool = True) -> str:
     """Return the problem and what is needed instead, such as `must be at least 1 (given: 0)`."""
     kind, context, given = item["type"], item.get("ctx", {}), item["input"]
     if kind == "missing":
@@ -119,11 +142,12 @@ def wording(item: ErrorDetails) -> str:
         text = f"must be {words} {context[key]:g}"
     elif kind == "literal_error":
         allowed = context["expected"].replace(" or ", ", ")
-        near = did_you_mean(given, re.findall("'([^']*)'", allowed)) if isinstance(given, str) else ""
-        return f"must be one of {allowed} (given: {given!r}){near}"
+        names = re.findall("'([^']*)'", allowed) if suggest and isinstance(given, str) else ()
+        return f"must be one of {allowed} (given: {given!r}){did_you_mean(str(given), names)}"
     elif kind in ("too_short", "too_long"):
         words, limit = ("at least", "min_length") if kind == "too_short" else ("at most", "max_length")
-        return f"must have {words} {context[limit]} items, not {context['actual_length']}"
+        number = context["actual_length"]
+        return f"must have {words} {context[limit]} items" + ("" if number is None else f", not {number}")
     elif kind in _NEEDED:
         text = f"must be {_NEEDED[kind]}"
     else:
@@ -137,15 +161,15 @@ def wording(item: ErrorDetails) -> str:
     )
 
 
-def _choice(item: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:
+def _choice(item: ErrorDetails, models: Sequence[type[BaseModel]], suggest: bool) -> list[str]:
     """Return the text of an error in the key that selects one of several models."""
     context = item["ctx"]
     given = f" (given: {context['tag']!r})" if "tag" in context else ""
     expected = context.get("expected_tags") or ", ".join(
         sorted(repr(tag) for each in models for tag in _tags_of(each))
     )
-    near = did_you_mean(str(context.get("tag", "")), re.findall("'([^']*)'", expected))
-    return f"must be one of {expected}{given}{near}"
+    names = re.findall("'([^']*)'", expected) if suggest else ()
+    return [f"must be one of {expected}{given}{did_you_mean(str(context.get('tag', '')), names)}"]
 
 
 def _along(
@@ -167,8 +191,8 @@ def _along(
         keys.append(step)
         if isinstance(step, str):
             fields = [_keys_of(each)[step] for each in models if step in _keys_of(each)]
-            within_mapping = any(get_origin(annotation) is dict for annotation in fields)
-            models = [below for annotation in fields for below in _models_in(annotation)]
+            within_mapping = any(field.is_mapping for field in fields)
+            models = [below for field in fields for below in field.models]
     return tuple(keys), models
 
 
@@ -199,15 +223,31 @@ def _dotted(document: Any, location: Sequence[int | str]) -> str:
     return ".".join(steps)
 
 
-def _keys_of(model: type[BaseModel]) -> dict[str, Any]:
-    """Return the keys of a table, each with the annotation of its value."""
-    return {field.alias or name: field.annotation for name, field in model.model_fields.items()}
+class _Key(NamedTuple):
+    """The value of a key of a table."""
+
+    annotation: Any
+    models: list[type[BaseModel]]
+    """Models of the tables in it."""
+    is_mapping: bool
+    """Whether it is a table whose keys the document chooses."""
 
 
+@cache
+def _keys_of(model: type[BaseModel]) -> dict[str, _Key]:
+    """Return the keys of a table."""
+    annotations = {field.alias or name: field.annotation for name, field in model.model_fields.items()}
+    return {
+        key: _Key(annotation, _models_in(annotation), get_origin(annotation) is dict)
+        for key, annotation in annotations.items()
+    }
+
+
+@cache
 def _tags_of(model: type[BaseModel]) -> tuple[object, ...]:
     """Return the discriminator values of a model: the values of fields that allow only one."""
     literals = (
-        get_args(annotation) for annotation in _keys_of(model).values() if get_origin(annotation) is Literal
+        get_args(key.annotation) for key in _keys_of(model).values() if get_origin(key.annotation) is Literal
     )
     return tuple(values[0] for values in literals if len(values) == 1)
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import logging
 import math
 import os
 import re
 import shutil
+import stat
 import sys
 import tempfile
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -27,6 +31,7 @@ Tables = dict[str, NDArray[np.generic]]
 LIMIT_VARIABLE: Final = "STARHIL_CACHE_LIMIT_MB"
 DEFAULT_LIMIT_MB: Final = 500.0
 BYTES_PER_MB: Final = 1_000_000
+_PRIVATE: Final = 0o700
 _KERNELS: Final = "kernels"
 KERNEL_SUFFIX: Final = ".kernel"
 _OWN_NAME: Final = re.compile(
@@ -36,11 +41,26 @@ _OWN_NAME: Final = re.compile(
 
 
 def cache_dir() -> Path:
-    """Return the folder for cached files; it need not exist yet.
+    """Return the folder for cached files, which exists unless it cannot be made.
 
     ``STARHIL_CACHE_DIR`` if set, else ``starhil`` under ``XDG_CACHE_HOME``, else under the platform's cache
-    folder, else (without a home folder) under the temporary folder.
+    folder, else (without a home folder) a folder of the user under the temporary folder. Compiled kernels run as
+    they are read, so a folder to which others can write is not used (`insecurity`): a warning is logged, and the
+    folder under the temporary folder is used instead, or if that is not secure either, one of this process alone.
     """
+    chosen, own = _chosen_folder(), Path(tempfile.gettempdir()) / f"starhil-cache-{_user()}"
+    for folder in dict.fromkeys((chosen or own, own)):
+        with contextlib.suppress(OSError, ValueError):
+            folder.mkdir(_PRIVATE, parents=True, exist_ok=True)
+        problem = insecurity(folder)
+        if not problem:
+            return folder
+        _warn_not_used(folder, problem)
+    return _folder_of_process()
+
+
+def _chosen_folder() -> Path | None:
+    """Return the folder that the environment names; None for a user without a home folder."""
     own = os.environ.get("STARHIL_CACHE_DIR")
     if own:
         return Path(own)
@@ -53,8 +73,80 @@ def cache_dir() -> Path:
     try:
         home = Path.home()
     except RuntimeError:
-        return Path(tempfile.gettempdir()) / "starhil-cache"
+        return None
     return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "starhil"
+
+
+def _user() -> int:
+    """Return the number of the user; 0 on Windows, where the temporary folder is the user's own."""
+    return 0 if sys.platform == "win32" else os.geteuid()
+
+
+def insecurity(folder: Path) -> str:
+    """Return why others could put files into a folder, as text; empty if only its user and root can.
+
+    The folder must belong to the user or to root, and so must what leads to it, links included. Nobody else may
+    write there, except to a folder above it in which only owners can rename files (sticky, as ``/tmp``). Write
+    permission of a group is accepted for the private group of the user: of the same name, without other members.
+    A read-only cache of root in the image of a container is secure.
+    """
+    if sys.platform == "win32":
+        return ""
+    try:
+        path = folder.absolute()
+        resolved = path.resolve()
+    except (
+        OSError,
+        ValueError,
+        RuntimeError,
+    ):  # no valid name, or a loop of links: nothing can be read there
+        return ""
+    for each in dict.fromkeys((path, resolved, *path.parents, *resolved.parents)):
+        try:
+            status = each.lstat()
+        except (OSError, ValueError):  # not made yet: what is above it decides
+            continue
+        if status.st_uid not in (_user(), 0):
+            return f"{each} belongs to user {status.st_uid}"
+        if stat.S_ISLNK(status.st_mode) or (each not in (path, resolved) and status.st_mode & stat.S_ISVTX):
+            continue
+        by_group = status.st_mode & stat.S_IWGRP and not _is_private_group(status.st_gid)
+        if by_group or status.st_mode & stat.S_IWOTH:
+            return f"others may write to {each}"
+    return ""
+
+
+def _is_private_group(group: int) -> bool:
+    """Return whether a group has the name of the user, and no other members.
+
+    Not group 0, to which every user of a container may belong.
+    """
+    import grp
+    import pwd
+
+    try:
+        name, members = pwd.getpwuid(_user()).pw_name, grp.getgrgid(group)
+    except KeyError:
+        return False
+    return group != 0 and members.gr_name == name and set(members.gr_mem) <= {name}
+
+
+@cache
+def _warn_not_used(folder: Path, problem: str) -> None:
+    """Warn, once per folder and reason, that a cache folder is not secure."""
+    _log.warning(
+        "cache folder %s is not used: %s; set STARHIL_CACHE_DIR to a folder that only you can write to",
+        folder,
+        problem,
+    )
+
+
+@cache
+def _folder_of_process() -> Path:
+    """Make a folder for this process alone, which is removed at its end."""
+    folder = Path(tempfile.mkdtemp(prefix="starhil-cache-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def kernel_folder(key: str) -> Path | None:
@@ -63,6 +155,10 @@ def kernel_folder(key: str) -> Path | None:
     The folder need not exist yet.
     """
     folder = cache_dir() / _KERNELS / key
+    problem = insecurity(folder)
+    if problem:
+        _warn_not_used(folder, problem)
+        return _folder_of_process() / _KERNELS / key
     if folder.is_dir():
         return folder
     nearest = next(parent for parent in folder.parents if os.access(parent, os.F_OK))

@@ -2,6 +2,7 @@
 
 python tools/fuzz.py [--seconds 60] [TARGET …]     for this long each; all targets by default
 python tools/fuzz.py --list
+python tools/fuzz.py --growth [CHANNEL …]          work and time per byte of growing messages on each channel
 
 Each target begins with its seeds and its corpus, tests/fuzzing/corpus/TARGET.txt. An input that fails is written to out/fuzz and
 printed as a line for that file; the exit status is 1. Afterwards the corpus is renewed with the inputs that reach most for their
@@ -154,13 +155,45 @@ def fuzz(name: str, target: Target, kept: list[bytes], seconds: float) -> bool:
     return True
 
 
+def measure_growth(wanted: list[str]) -> bool:
+    """Print for each channel the largest growth of calls and of time per byte; return whether the calls stay within the limit."""
+    sys.path.insert(0, str(ROOT))
+    from tests.fuzzing import growth
+
+    good = True
+    for name, channel in growth.channels().items():
+        if wanted and not any(fnmatch(name, pattern) for pattern in wanted):
+            continue
+        calls, times = [], []
+        for label, small, large in growth.pairs(channel):
+            growth.processed(channel, small)  # what is computed once
+            longer = max(1.0, len(large) / len(small))
+            few, many = growth.work(channel, small), growth.work(channel, large)
+            calls.append((max(0, many - growth.FIXED_WORK) / (few * longer), label))
+            short_s, long_s = growth.seconds(channel, small), growth.seconds(channel, large)
+            times.append((long_s / (longer * short_s + growth.FIXED_S), label, 1e9 * long_s / len(large)))
+        (by_calls, where), (by_time, slow, ns) = max(calls), max(times)
+        good = good and by_calls <= growth.GROWTH
+        print(
+            f"{name:22s} {len(calls):4d} messages, per byte from {growth.SMALL} to {growth.LARGE} bytes: calls × {by_calls:.2f} "
+            f"({where}), time × {by_time:.2f} ({slow}, {ns:.0f} ns)",
+            flush=True,
+        )
+    return good
+
+
 def main() -> None:
     """Fuzz the targets one after the other."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("targets", nargs="*", metavar="TARGET", help="a name, or a pattern such as serial-*")
     parser.add_argument("--seconds", type=float, default=60.0, help="time for each target")
     parser.add_argument("--list", action="store_true", help="print the targets")
+    parser.add_argument(
+        "--growth", action="store_true", help="measure growing messages; the names are those of channels"
+    )
     options = parser.parse_args()
+    if options.growth:
+        sys.exit(not measure_growth(options.targets))
     targets = load_targets()
     from tests.fuzzing.targets import read_corpus
 

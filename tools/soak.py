@@ -15,14 +15,21 @@ descriptors   may not grow: every round ends in the same state, without any clie
 latency       p99 may grow by half plus 10 ms; growing lists or queues would exceed this in time.
 
 Prints one line per round and the figures at start and end; exit status 1 on growth or a failed session.
+
+With `--worst`, an OBC polls while each channel gets its worst messages of 64 kB, two a second: the p99 of its replies may be twice
+that without them. Windows with and without messages alternate, so that a busy machine slows both; exit status 1 on slower replies.
 """
 
 from __future__ import annotations
 
 import argparse
+import asyncio
 import contextlib
+import json
 import random
+import socket
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -31,6 +38,9 @@ from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
 from typing import Any
+from urllib.parse import urlsplit
+
+from aiohttp import ClientSession, ClientWebSocketResponse
 
 from starhil.hil_tests.bench import LinkOptions
 from starhil.hil_tests.client import ObcClient
@@ -62,6 +72,52 @@ FAULTS: tuple[dict[str, Any], ...] = (
     {"optical": {"false_stars": 50}},
     {"device": {"stuck": True}},
 )
+
+
+WORST_BYTES = 64_000
+"""Size of each message of `--worst`; a datagram has at most 65 507 bytes."""
+WORST_EVERY_S = 0.5
+WINDOW_POLLS = 100
+WORST_WINDOWS = 4
+"""Number of windows with messages for each channel."""
+SLOWEST_RATIO = 2.0
+
+Send = Callable[[], object]
+
+
+def worst_requests() -> list[dict[str, Any]]:
+    """Return requests on the control channel with as many errors, or as long ones, as fit."""
+
+    def keys(name: str) -> dict[str, int]:
+        return {f"{name}{number:05}": 1 for number in range(WORST_BYTES // (len(name) + 12))}
+
+    segments = [{"do": "hold", **{f"s{number}": 1 for number in range(13)}}] * 440
+    truths: list[dict[str, Any]] = [
+        {"kind": "slew", "segments": [{}] * (WORST_BYTES // 5)},
+        {"kind": "slew", "segments": segments},
+        {"kind": "fixed", **keys("attitud")},
+        {"kind": "a" * (WORST_BYTES - 99)},
+    ]
+    faults: list[dict[str, Any]] = [
+        {"optical": {"planets": [{"ra_deg": 1}] * (WORST_BYTES // 17)}},
+        {"optical": keys("moon")},
+        {"serial": keys("drap")},
+        {"device": {"error": "sensor" * (WORST_BYTES // 7)}},
+    ]
+    return [
+        *({"do": "set_truth", "truth": truth} for truth in truths),
+        *({"do": "fault", **fault} for fault in faults),
+    ]
+
+
+def worst_datagrams() -> list[bytes]:
+    """Return datagrams of a feed: very many messages, and a very long one."""
+    message = b'{"q":[0,0,0,1]}\n'
+    return [
+        message * (WORST_BYTES // len(message)),
+        b"{}\n" * (WORST_BYTES // 3),
+        b'{"q":[' + b"1," * (WORST_BYTES // 2 - 9) + b"1]}",
+    ]
 
 
 @dataclass(frozen=True)
@@ -234,13 +290,163 @@ def soak(seconds: float) -> list[Sample]:
     return samples
 
 
+@contextlib.contextmanager
+def sending(send: Send) -> Iterator[None]:
+    """Call a function at intervals in a thread."""
+    ended = threading.Event()
+
+    def repeat() -> None:
+        while not ended.wait(WORST_EVERY_S):
+            send()
+
+    thread = threading.Thread(target=repeat)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def polled_ms(obc: ObcClient, rng: random.Random) -> list[float]:
+    """Return the latencies of a window of requests, a hundred a second, milliseconds."""
+    taken = []
+    for _ in range(WINDOW_POLLS):
+        begin = time.perf_counter()
+        obc.telemetry(rng.choice(ROWS))
+        taken.append(1e3 * (time.perf_counter() - begin))
+        time.sleep(0.01)
+    return taken
+
+
+class Page:
+    """A page of the console, which stays open."""
+
+    def __init__(self, view: str, stack: ExitStack) -> None:
+        page = urlsplit(view)
+        self._runner = stack.enter_context(asyncio.Runner())
+        session = self._runner.run(self._open())
+        stack.callback(lambda: self._runner.run(session.close()))
+        address = f"http://{page.netloc}/ws?{page.query}"
+        self._pages = self._runner.run(self._connect(session, address))
+
+    @staticmethod
+    async def _open() -> ClientSession:
+        return ClientSession()
+
+    @staticmethod
+    async def _connect(session: ClientSession, address: str) -> ClientWebSocketResponse:
+        return await session.ws_connect(address, max_msg_size=0)
+
+    def ask(self, request: dict[str, Any]) -> None:
+        """Send a request and wait for its answer."""
+        self._runner.run(self._ask(request))
+
+    async def _ask(self, request: dict[str, Any]) -> None:
+        await self._pages.send_str(json.dumps({**request, "id": 1}))
+        async for message in self._pages:  # ends if the console closes
+            if '"type": "answer"' in str(message.data)[:60]:
+                return
+
+
+class Attack:
+    """A running emulator, and its worst messages on each channel."""
+
+    def __init__(self, emulator: EmulatorProcess, stack: ExitStack) -> None:
+        self._ready = emulator.ready
+        self._turn = 0
+        self._page = Page(self._ready["view"], stack)
+        self._control = stack.enter_context(ControlClient(self._ready["control"]))
+        self._feed = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+        host, _, port = self._ready["can"].removeprefix("socketcand:").partition("/")[0].partition(":")
+        self._hub = stack.enter_context(socket.create_connection((host, int(port))))
+        self._hub.sendall(b"< open vcan0 >")
+        self.channels: dict[str, Send] = {
+            "control": self._to_control,
+            "console": self._to_console,
+            "feed": self._to_feed,
+            "serial": self._to_serial,
+            "hub": lambda: self._hub.sendall(b"< send 1234567 8 1 2 3 4 5 6 7 > <" * (WORST_BYTES // 35)),
+            "CAN": lambda: self._hub.sendall(b"< send 07030104 8 1 2 3 4 5 6 7 9 >" * (WORST_BYTES // 35)),
+        }
+
+    def _next(self, messages: Sequence[Any]) -> Any:
+        self._turn += 1
+        return messages[self._turn % len(messages)]
+
+    def _to_control(self) -> None:
+        with contextlib.suppress(BenchError):
+            request = dict(self._next(worst_requests()))
+            self._control.do(request.pop("do"), **request)
+
+    def _to_console(self) -> None:
+        request = self._next(worst_requests())
+        wanted = [{"do": "control", "request": request}, {"do": "encode", "row": "a" * (WORST_BYTES - 99)}]
+        self._page.ask(wanted[self._turn % 2])
+
+    def _to_serial(self) -> None:
+        with Path(self._ready["serial"]).open("wb", buffering=0) as line:
+            line.write(b"\x1f\x7f\x80" * (WORST_BYTES // 3))
+
+    def _to_feed(self) -> None:
+        host, _, port = self._ready["truth"].removeprefix("udp:").rpartition(":")
+        self._feed.sendto(self._next(worst_datagrams()), (host, int(port)))
+
+
+def worst(wanted: Sequence[str]) -> bool:
+    """Print the p99 of replies with and without the worst messages of each channel; return whether all is well.
+
+    The OBC polls on the serial line, and on CAN while the serial line gets the messages.
+    """
+    good, rng = True, random.Random(1)  # noqa: S311 (rows to request, not secrets)
+    with ExitStack() as stack:
+        hub = stack.enter_context(EmulatorProcess(hub_command()))
+        command = emulator_command(
+            profile="demo",
+            can=hub.ready["can"],
+            seed=1,
+            settings=[f"links.serial.baud={BAUD}", "truth.kind=live"],
+            extra=["--control", "auto", "--view", "auto"],
+        )
+        emulator = stack.enter_context(EmulatorProcess(command))
+        attack = Attack(emulator, stack)
+        on_serial = ObcClient.open(serial=emulator.ready["serial"], baud=BAUD, timeout_s=SETTLE_S)
+        on_can = ObcClient.open(can=emulator.ready["can"], timeout_s=SETTLE_S)
+        for obc in (on_serial, on_can):
+            polled_ms(stack.enter_context(obc), rng)  # warm up
+        for name, send in attack.channels.items():
+            if wanted and name not in wanted:
+                continue
+            obc = on_can if name == "serial" else on_serial
+            without: list[float] = []
+            with_messages: list[float] = []
+            for _ in range(WORST_WINDOWS):
+                without += polled_ms(obc, rng)
+                with sending(send):
+                    with_messages += polled_ms(obc, rng)
+            before, after = percentile(without, 0.99), percentile(with_messages, 0.99)
+            slower = after > SLOWEST_RATIO * before
+            good = good and not slower
+            print(
+                f"{name:8s} p99 {before:6.1f} ms without, {after:6.1f} ms with messages of {WORST_BYTES} bytes, "
+                f"maximum {max(without):6.1f} and {max(with_messages):6.1f} ms  {'SLOWER' if slower else 'ok'}",
+                flush=True,
+            )
+    return good
+
+
 def main() -> int:
     """Run the soak test and print the result; return 0 if nothing grew."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=15.0, help="how long")
-    minutes = parser.parse_args().minutes
+    parser.add_argument(
+        "--worst", nargs="*", metavar="CHANNEL", help="the worst messages of each channel instead"
+    )
+    options = parser.parse_args()
     try:
-        figures = compare(soak(60.0 * minutes))
+        if options.worst is not None:
+            return int(not worst(options.worst))
+        figures = compare(soak(60.0 * options.minutes))
     except (BenchError, ValueError) as error:
         print(f"soak: {error}", file=sys.stderr)
         return 1

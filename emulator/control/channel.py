@@ -48,7 +48,12 @@ from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
 
-MAX_LINE: Final = 1 << 20
+MAX_LINE: Final = 1 << 16
+"""Longest request, bytes."""
+
+EXAMINED: Final = 200
+"""Number of errors of a request that are examined; of further ones the answer gives the number."""
+
 KEPT_FRAMES: Final = 200
 BUSY: Final = b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
 
@@ -245,7 +250,7 @@ class ControlServer:
         if "truth" in request:
             if not isinstance(request["truth"], dict):
                 raise EmulatorError("truth: must be an object with the keys of [truth] in a profile")
-            config = _parse(_Truth, request).truth
+            config = (await _parse(_Truth, request)).truth
         async with self._opening:  # reading a file takes time, so the last request wins
             await self._run.truth.set(config)
         return {"kind": config.kind, "address": self._run.truth.address}
@@ -258,7 +263,7 @@ class ControlServer:
         return {"run_time_s": clock.now_ns() / NANOSECONDS}
 
     async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
-        wanted = _parse(FaultRequest, request)
+        wanted = await _parse(FaultRequest, request)
         head.faults.check(wanted)
         self._run.record("fault", request=request)
         head.faults.inject(wanted)
@@ -288,12 +293,16 @@ class _Truth(BaseModel):
     truth: TruthConfig
 
 
-def _parse(model: type[Model], value: object) -> Model:
-    """Validate the arguments of a request; the error message is one line."""
-    try:
-        return model.model_validate_json(json.dumps(value))
-    except ValidationError as error:
-        raise EmulatorError(*map(str, problems(error, model, value))) from None
+async def _parse(model: type[Model], value: object) -> Model:
+    """Validate the arguments of a request in a thread, while the links are served; the error message is one line."""
+
+    def parse() -> Model:
+        try:
+            return model.model_validate_json(json.dumps(value))
+        except ValidationError as error:
+            raise EmulatorError(*map(str, problems(error, model, value, most=EXAMINED))) from None
+
+    return await asyncio.to_thread(parse)
 
 
 def _check_keys(request: dict[str, Any], known: tuple[str, ...]) -> None:

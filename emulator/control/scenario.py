@@ -20,7 +20,7 @@ cannot set a live feed, because opening a socket takes time.
 from __future__ import annotations
 
 import logging
-from typing import Annotated, Self
+from typing import Annotated, Final, Self
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -37,6 +37,10 @@ from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")
+
+
+MAX_EVENTS: Final = 1000
+"""Most events of a scenario."""
 
 
 class ScenarioEvent(Strict):
@@ -83,7 +87,7 @@ class Scenario(Strict):
 
     name: str = ""
     """Name in messages."""
-    at: Annotated[list[ScenarioEvent], Field(min_length=1)]
+    at: Annotated[list[ScenarioEvent], Field(min_length=1, max_length=MAX_EVENTS)]
     """Events, in any order."""
 
     def prepare(self, head: Head, truth: Truth | None, start_s: float = 0.0) -> list[tuple[int, Action]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Self
@@ -20,6 +20,9 @@ from starhil.protocol.names import remedy
 from starid.arrays import Array
 
 _MAX_OBJECTS: Final = 100_000
+
+MAX_ROWS: Final = 200
+"""Most planets, obstructions, or corners of an obstruction."""
 
 
 def limited(low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
@@ -203,6 +206,7 @@ class SkyObjects:
             rows = fields.get(name, ())
             if not isinstance(rows, (list, tuple)):
                 raise EmulatorError(f"sky {name}: must be a list of tables")
+            _check_count(f"sky {name}", rows)
             fields[name] = tuple(_from_table(name, element, row) for row in rows)
         if share is not None and share != 0:
             edge = _from_table("blocked_share", Obstruction, {"share": share})
@@ -222,6 +226,12 @@ class SkyObjects:
     def has_extended_objects(self) -> bool:
         """Whether anything lights or covers an area of the image."""
         return bool(self.moon or self.sun or self.earth or self.obstructions or self.blank)
+
+
+def _check_count(where: str, rows: Sequence[object]) -> None:
+    """Reject a list that would make every image slow."""
+    if len(rows) > MAX_ROWS:
+        raise EmulatorError(f"{where}: must have at most {MAX_ROWS} items, not {len(rows)}")
 
 
 def _pair(name: str, value: Any) -> tuple[float, float]:
@@ -255,6 +265,7 @@ def _from_table(name: str, kind: Any, values: Any) -> Any:
     if "polygon_px" in arguments:
         if not isinstance(arguments["polygon_px"], (list, tuple)):
             raise EmulatorError(f"{where}: polygon_px must be a list of corners [x, y]")
+        _check_count(f"{where}: polygon_px", arguments["polygon_px"])
         arguments["polygon_px"] = tuple(_pair("polygon_px", corner) for corner in arguments["polygon_px"])
     return kind(**arguments)
 

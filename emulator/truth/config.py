@@ -246,6 +246,9 @@ class SlewToConfig(Strict):
         )
 
 
+MAX_SEGMENTS: Final = 500
+"""Most segments of a slew; a longer motion is a file. They fit into one request on the control channel."""
+
 SegmentConfig: TypeAlias = Annotated[HoldConfig | TurnConfig | SlewToConfig, Field(discriminator="do")]
 
 
@@ -253,7 +256,7 @@ class SlewConfig(StartConfig):
     """A sequence of holds, constant rates and slews."""
 
     kind: Literal["slew"]
-    segments: Annotated[list[SegmentConfig], Field(min_length=1)]
+    segments: Annotated[list[SegmentConfig], Field(min_length=1, max_length=MAX_SEGMENTS)]
     """Segments in order."""
     repeat: bool = False
     """Whether to start again after the last segment."""

@@ -72,6 +72,10 @@ class LockStep:
         return "" if accepted else self._truth.last_fault
 
 
+MAX_LINES: Final = 32
+"""Most lines of a datagram."""
+
+
 class _Datagrams(asyncio.DatagramProtocol):
     """Passes each line of each datagram to the feed."""
 
@@ -80,9 +84,12 @@ class _Datagrams(asyncio.DatagramProtocol):
 
     def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002 (asyncio's signature)
         """Process a datagram."""
-        for line in data.splitlines():
+        lines = data.split(b"\n", MAX_LINES)
+        for line in lines[:MAX_LINES]:
             if line.strip():
                 self._feed.receive(line)
+        if any(line.strip() for line in lines[MAX_LINES:]):
+            self._feed.truth.reject(f"datagram of more than {MAX_LINES} lines")
 
 
 class LiveFeed:
@@ -135,8 +142,14 @@ class LiveFeed:
 
     def receive(self, data: bytes) -> None:
         """Process one received message."""
+        if len(data) > self.truth.format.max_size:
+            self.truth.reject(self._too_long())
+            return
         self._message_received(data)
         self.truth.receive(data, self._now_s())
+
+    def _too_long(self) -> str:
+        return f"message longer than {self.truth.format.max_size} bytes"
 
     async def process(self, data: bytes) -> str:
         """Process one message; return the fault of a message rejected in lock-step."""
@@ -177,7 +190,7 @@ class LiveFeed:
         try:
             async for data in read_lines(reader, self.truth.format.max_size, self.truth.format.end):
                 if data is None:
-                    self.truth.reject(f"message longer than {self.truth.format.max_size} bytes")
+                    self.truth.reject(self._too_long())
                 else:
                     await self._answer(data, writer)
         except ConnectionError:

@@ -4,7 +4,8 @@ import asyncio
 
 import pytest
 
-from starhil.emulator.json_lines import QUOTED, TURN, JsonError, parse_object, read_lines
+from starhil.emulator.json_lines import TURN, JsonError, parse_object, read_lines
+from starhil.protocol.errors import LONGEST_PROBLEM
 
 LIMIT = 10_000
 
@@ -87,4 +88,4 @@ def test_what_is_no_unambiguous_object_is_said(line, said):
 def test_an_error_does_not_repeat_a_long_line(line):
     with pytest.raises(JsonError) as refusal:
         parse_object(line)
-    assert len(str(refusal.value)) < QUOTED + 40
+    assert len(str(refusal.value)) < LONGEST_PROBLEM + 40

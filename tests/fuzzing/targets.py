@@ -4,7 +4,7 @@ A target raises nothing but what is documented, as one line of text; anything el
 by coverage; `test_corpus.py` repeats the inputs that were worth keeping.
 """
 
-from tests.fuzzing import control, files, wire
+from tests.fuzzing import control, files, growth, wire
 from tests.fuzzing.target import CORPUS, TARGETS, Target, read_corpus
 
-__all__ = ["CORPUS", "TARGETS", "Target", "control", "files", "read_corpus", "wire"]
+__all__ = ["CORPUS", "TARGETS", "Target", "control", "files", "growth", "read_corpus", "wire"]

@@ -1,0 +1,119 @@
+"""What a peer sends costs no more than its size: long lists are rejected unread, and errors are worded outside the loop."""
+
+from __future__ import annotations
+
+import json
+import threading
+from typing import Any
+
+import pytest
+
+from starhil.emulator.control import channel, scenario
+from starhil.emulator.control.channel import MAX_LINE
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile import load_profile
+from starhil.emulator.sky.objects import MAX_ROWS, SkyObjects
+from starhil.emulator.truth.config import MAX_SEGMENTS
+from starhil.emulator.truth.feed import MAX_LINES, LiveFeed, _Datagrams
+from starhil.emulator.truth.live import LiveTruth
+from starhil.hil_tests.script import ScriptError, load_script
+from starhil.protocol.errors import LONGEST_PROBLEM, MAX_PROBLEMS
+from starhil.protocol.icd import load_unit
+from starid.attitude import Attitude
+from tests.fuzzing.control import _Loop
+
+HOLD = {"do": "hold", "seconds": 1.0}
+LARGEST_ANSWER = (MAX_PROBLEMS + 1) * (LONGEST_PROBLEM + 10)
+
+
+def keys(name: str) -> dict[str, int]:
+    return {f"{name}{number:04}": 1 for number in range(4000 - 10 * len(name))}
+
+
+WORST: dict[str, dict[str, Any]] = {
+    "empty segments": {"do": "set_truth", "truth": {"kind": "slew", "segments": [{}] * 16_000}},
+    "wrong segments": {"do": "set_truth", "truth": {"kind": "slew", "segments": [{"do": "hold"}] * MAX_SEGMENTS}},
+    "keys of a truth": {"do": "set_truth", "truth": {"kind": "fixed", **keys("a")}},
+    "a long kind": {"do": "set_truth", "truth": {"kind": "fixed" * 13_000}},
+    "planets": {"do": "fault", "optical": {"planets": [{"ra_deg": 1}] * 4200}},
+    "keys of a sky": {"do": "fault", "optical": keys("moon")},
+    "keys of a link": {"do": "fault", "serial": keys("drop")},
+    "a long error": {"do": "fault", "device": {"error": "x" * 65_000}},
+    "a long name": {"do": "scenario", "name": "x" * 65_000},
+    "a long action": {"do": "status" * 10_000},
+    "a long key": {"do": "status", "x" * 65_000: 1},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run_() -> _Loop:
+    return _Loop()
+
+
+@pytest.mark.parametrize("name", WORST)
+def test_the_worst_requests_of_64_kb_are_worded_outside_the_loop_in_a_short_answer(
+    run_: _Loop, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    threads: list[threading.Thread] = []
+    problems = channel.problems
+
+    def noting(*arguments: Any, **options: Any) -> Any:
+        threads.append(threading.current_thread())
+        return problems(*arguments, **options)
+
+    monkeypatch.setattr(channel, "problems", noting)
+    line = json.dumps(WORST[name]).encode()
+    assert len(line) <= MAX_LINE
+    answer = run_.call(run_.control.answer(line))
+    assert not answer["ok"]
+    assert len(json.dumps(answer)) <= LARGEST_ANSWER
+    assert threading.main_thread() not in threads
+
+
+def test_a_slew_may_have_as_many_segments_as_fit_into_a_request(run_: _Loop) -> None:
+    for count, ok in ((MAX_SEGMENTS, True), (MAX_SEGMENTS + 1, False)):
+        request = {"do": "set_truth", "truth": {"kind": "slew", "segments": [HOLD] * count}}
+        assert run_.call(run_.control.answer(json.dumps(request)))["ok"] == ok
+    assert run_.call(run_.control.answer(b'{"do": "set_truth"}'))["ok"]
+
+
+def test_a_scenario_and_a_sky_have_limits() -> None:
+    event = {"run_time_s": 1.0, "clear_faults": True}
+    scenario.Scenario.model_validate({"at": [event] * scenario.MAX_EVENTS})
+    with pytest.raises(ValueError, match="at most 1000"):
+        scenario.Scenario.model_validate({"at": [event] * (scenario.MAX_EVENTS + 1)})
+    planet = {"ra_deg": 1.0, "dec_deg": 2.0, "magnitude": 3.0}
+    for rows in ({"planets": [planet]}, {"obstructions": [{}]}):
+        ((name, row),) = rows.items()
+        SkyObjects.from_dict({name: row * MAX_ROWS})
+        with pytest.raises(EmulatorError, match=f"sky {name}: must have at most {MAX_ROWS} items, not 201"):
+            SkyObjects.from_dict({name: row * (MAX_ROWS + 1)})
+    with pytest.raises(EmulatorError, match="polygon_px: must have at most"):
+        SkyObjects.from_dict({"obstructions": [{"polygon_px": [[0.0, 0.0]] * (MAX_ROWS + 1)}]})
+
+
+def test_a_datagram_is_read_up_to_a_number_of_lines_and_a_length() -> None:
+    truth = LiveTruth(Attitude.identity())
+    datagrams = _Datagrams(LiveFeed(truth, lambda: 1.0))
+    message = b'{"q": [0, 0, 0, 1]}'
+    datagrams.datagram_received(b"\n".join([message] * MAX_LINES) + b"\n", None)
+    assert (truth.accepted, truth.refused) == (MAX_LINES, 0)
+    datagrams.datagram_received(b"\n".join([message] * 3000), None)
+    assert (truth.accepted, truth.refused) == (2 * MAX_LINES, 1)
+    assert truth.last_fault == f"datagram of more than {MAX_LINES} lines"
+    datagrams.datagram_received(b'{"q": [' + b"0, " * 5000 + b"1]}", None)
+    assert truth.last_fault == "message longer than 4096 bytes"
+
+
+def test_the_rest_of_a_file_with_very_many_errors_is_not_checked(tmp_path: Any) -> None:
+    profile = tmp_path / "profile.toml"
+    profile.write_text("[sensor]\n" + "".join(f"gian{number} = 1\n" for number in range(5000)))
+    with pytest.raises(EmulatorError) as caught:
+        load_profile(str(profile))
+    assert len(caught.value.args) == MAX_PROBLEMS
+    assert "4981 more keys are not checked; correct these first" in str(caught.value)
+    session = tmp_path / "session.toml"
+    session.write_text("[[step]]\ntelemetri = 'x'\n" * 5000)
+    with pytest.raises(ScriptError, match="4980 more steps are not checked; correct these first") as wrong:
+        load_script(session, load_unit())
+    assert len(wrong.value.args) == MAX_PROBLEMS + 1
