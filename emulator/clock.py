@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 from starhil.emulator.errors import EmulatorError
-from starid.files import read_number
+from starid.storage.files import read_number
 
 NANOSECONDS: Final = 1_000_000_000
 

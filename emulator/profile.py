@@ -46,7 +46,7 @@ from starhil.protocol.icd import load_unit
 from starhil.protocol.names import DEFAULT_UNIT, bundled_units, find, not_found, remedy
 from starhil.protocol.user_file import TomlError, parse_toml
 from starhil.protocol.validation_messages import problems
-from starid.earth import unix_time
+from starid.catalog.earth import unix_time
 
 if TYPE_CHECKING:
     from starhil.protocol.values import Parameter
@@ -248,7 +248,7 @@ def _checks(
         yield "sky", lambda table: Sky({**whole, **table})
     if "identifier" in values:
         from starhil.emulator.pipeline.star_identifiers import check_options
-        from starid.interface import ALGORITHMS
+        from starid.identification.interface import ALGORITHMS
 
         algorithm = run.get("algorithm", "geometric") if isinstance(run, dict) else "geometric"
         if algorithm in ALGORITHMS:

@@ -47,7 +47,7 @@ from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
-from starid.files import open_regular, read_text
+from starid.storage.files import open_regular, read_text
 
 Item = TypeVar("Item", bytes, CanFrame)
 Model = TypeVar("Model", bound=BaseModel)

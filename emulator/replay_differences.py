@@ -14,7 +14,7 @@ from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
 from starhil.emulator.truth_log import WALL_TIMES
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.messages import Reply, ReplyKind
-from starid.files import open_regular
+from starid.storage.files import open_regular
 
 
 def difference_sent(

@@ -25,7 +25,7 @@ from starhil.protocol.image_transfer import (
 )
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Value
-from starid.files import write_atomically
+from starid.storage.files import write_atomically
 
 FRAME_ATTEMPTS: Final = 3
 """Number of attempts to read a frame with a wrong checksum."""

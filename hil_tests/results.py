@@ -14,7 +14,7 @@ from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.expect import show
 from starhil.hil_tests.interruption import Interrupted
 from starhil.protocol.values import Value
-from starid.files import is_stream, write_atomically
+from starid.storage.files import is_stream, write_atomically
 
 PASSED: Final = "passed"
 FAILED: Final = "failed"

@@ -13,24 +13,24 @@ if TYPE_CHECKING:
     from starid.camera import Camera as Camera
     from starid.catalog import StarCatalog as StarCatalog
     from starid.catalog import load_catalog as load_catalog
-    from starid.geometric.identifier import Identifier as Identifier
+    from starid.identification.geometric.identifier import Identifier as Identifier
+    from starid.identification.interface import make_identifier as make_identifier
+    from starid.identification.solution import Solution as Solution
     from starid.imaging.detection import Detections as Detections
     from starid.imaging.detection import DetectionSettings as DetectionSettings
     from starid.imaging.detection import detect as detect
-    from starid.interface import make_identifier as make_identifier
-    from starid.solution import Solution as Solution
 
 _HOMES: Final = {
     "Attitude": "starid.attitude",
     "Camera": "starid.camera",
     "DetectionSettings": "starid.imaging.detection",
     "Detections": "starid.imaging.detection",
-    "Identifier": "starid.geometric.identifier",
-    "Solution": "starid.solution",
+    "Identifier": "starid.identification.geometric.identifier",
+    "Solution": "starid.identification.solution",
     "StarCatalog": "starid.catalog",
     "detect": "starid.imaging.detection",
     "load_catalog": "starid.catalog",
-    "make_identifier": "starid.interface",
+    "make_identifier": "starid.identification.interface",
 }
 """Public name → module that holds it."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 
-from starid.cache import cache_dir
+from starid.storage.cache import cache_dir
 
 CACHE = "STARHIL_CACHE_DIR"
 os.environ[CACHE] = str(cache_dir())  # by name: a test may set HOME or XDG_CACHE_HOME

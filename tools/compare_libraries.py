@@ -20,9 +20,9 @@ from starhil.emulator.sensor.renderer import Renderer
 from starid.attitude import random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
+from starid.identification.thesis.fsf import density_clusters
+from starid.identification.thesis.lasso import LAMBDAS, lasso_path
 from starid.imaging.detection import detect
-from starid.thesis.fsf import density_clusters
-from starid.thesis.lasso import LAMBDAS, lasso_path
 
 Array = np.ndarray[Any, np.dtype[Any]]
 Measurement = tuple[str, float, str]
@@ -122,7 +122,7 @@ def lasso(problems: int, seed: int) -> list[Measurement]:
             note,
         )
         for name, solve, note in (
-            ("starid.thesis.lasso", ours, "exact"),
+            ("starid.identification.thesis.lasso", ours, "exact"),
             ("sklearn.linear_model.lasso_path", theirs, f"minimum missed by up to {excess.max():.2g}"),
         )
     ]
@@ -143,7 +143,7 @@ def clusters(seed: int) -> list[Measurement]:
         same = np.array_equal(scan.fit(points).labels_, density_clusters(points, 0.4, least))
         note = "same labels" if same else "labels differ"
         of = f"{pairs**2} points"
-        rows.append((f"starid.thesis.fsf, {of}", median_ms(lambda p=points, m=least: density_clusters(p, 0.4, m), 9), note))  # type: ignore[misc]  # fmt: skip
+        rows.append((f"starid.identification.thesis.fsf, {of}", median_ms(lambda p=points, m=least: density_clusters(p, 0.4, m), 9), note))  # type: ignore[misc]  # fmt: skip
         rows.append((f"sklearn.cluster.DBSCAN, {of}", median_ms(lambda p=points, s=scan: s.fit(p), 9), note))  # type: ignore[misc]
     return rows
 

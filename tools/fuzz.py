@@ -41,8 +41,8 @@ INSTRUMENTED = (
     "starhil.hil_tests.emulator_process", "starhil.emulator.control", "starhil.emulator.console",
     "starhil.emulator.device", "starhil.emulator.truth", "starhil.emulator.profile",
     "starhil.emulator.replay", "starhil.emulator.replay_differences", "starhil.emulator.cli.endurance", "starhil.emulator.tape",
-    "starhil.emulator.json_lines", "starhil.emulator.toml_file", "starid.files",
-    "starid.imaging.image_io", "starid.camera_file", "starid.hipparcos", "starid.thesis.database_file",
+    "starhil.emulator.json_lines", "starhil.emulator.toml_file", "starid.storage.files",
+    "starid.imaging.image_io", "starid.camera.file", "starid.catalog.hipparcos", "starid.identification.thesis.database_file",
 )  # fmt: skip
 """Modules whose coverage guides; not those with kernels, because numba cannot read instrumented code."""
 

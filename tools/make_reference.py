@@ -328,7 +328,7 @@ def identifier() -> str:
     import importlib
 
     from starhil.emulator.profile_sections import RunConfig
-    from starid.interface import ALGORITHMS
+    from starid.identification.interface import ALGORITHMS
 
     parts = []
     for algorithm in get_args(RunConfig.model_fields["algorithm"].annotation):

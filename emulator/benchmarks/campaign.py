@@ -29,11 +29,11 @@ from starid.arrays import Array
 from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
+from starid.identification.interface import StarIdentifier, make_identifier
+from starid.identification.solution import Solution
 from starid.imaging.detection import detect
-from starid.interface import StarIdentifier, make_identifier
 from starid.photograph.field_sweep import FieldSweep
-from starid.result_store import Results, ResultStore
-from starid.solution import Solution
+from starid.storage.results import Results, ResultStore
 
 Plan = TypeVar("Plan")
 Made = TypeVar("Made")

@@ -195,7 +195,7 @@ def _rms(values: Array) -> float:
 
 def plot_centroids(rows: Sequence[CentroidRow], path: Path) -> None:
     """Plot error and bound against magnitude, one panel per rate, to an image or PDF file."""
-    from starid.plots import figure, save
+    from starid.storage.plots import figure, save
 
     rates = sorted({row.rate_deg_s for row in rows})
     plot, panels = figure(1, len(rates), width=3.4 * len(rates) + 0.8, sharey=True, squeeze=False)

@@ -31,7 +31,7 @@ from starhil.emulator.profile import load_profile
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.icd import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
-from starid.result_store import Results
+from starid.storage.results import Results
 
 RATES_DEG_S: Final = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 SUN_DEG: Final = (0.0, 10.0, 20.0, 30.0, 35.0, 45.0, 60.0, 90.0)

@@ -23,8 +23,8 @@ from starhil.emulator.benchmarks.ecss_errors import (
     static_errors,
     thermo_elastic_error,
 )
-from starid.files import write_atomically
-from starid.result_store import Results
+from starid.storage.files import write_atomically
+from starid.storage.results import Results
 
 INTERVAL: Final = 0.95
 """Confidence level of the intervals for probabilities."""
@@ -292,7 +292,7 @@ def _availability_csv(report: EcssReport) -> str:
 
 
 def _plot_errors(report: EcssReport, folder: Path) -> Path:
-    from starid.plots import figure, save
+    from starid.storage.plots import figure, save
 
     shown = [line for line in report.all_lines if line.arcsec is not None]
     fig, axes = figure(height=3.6)
@@ -308,7 +308,7 @@ def _plot_errors(report: EcssReport, folder: Path) -> Path:
 
 
 def _plot_availability(report: EcssReport, folder: Path) -> Path:
-    from starid.plots import figure, save
+    from starid.storage.plots import figure, save
 
     fig, axes = figure(2, 3, width=9.0, height=5.0, sharey=True)
     for axis, (name, (what, unit, _)) in zip(axes.flat, INFLUENCES.items(), strict=True):

@@ -19,9 +19,9 @@ from starhil.emulator.truth.orbit import KeplerOrbit
 from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
-from starid.earth import unix_time
+from starid.catalog.earth import unix_time
+from starid.identification.interface import make_identifier
 from starid.imaging.detection import detect
-from starid.interface import make_identifier
 
 _WARM_UP: Final = 3
 

@@ -31,7 +31,7 @@ def info(as_json: AsJson = False) -> None:
     Above the limit, the least recently used files are removed. The environment variables STARHIL_CACHE_DIR
     and STARHIL_CACHE_LIMIT_MB set the folder and the limit.
     """
-    from starid.cache import BYTES_PER_MB, cache_dir, cached_files, size_limit
+    from starid.storage.cache import BYTES_PER_MB, cache_dir, cached_files, size_limit
 
     files = cached_files()
     total = sum(each.size for each in files)
@@ -66,7 +66,7 @@ def warm(
     from starhil.emulator.pipeline_setup import pipeline_setup
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
     from starhil.protocol.icd import load_unit
-    from starid.cache import cache_dir, kernels_written_since
+    from starid.storage.cache import cache_dir, kernels_written_since
 
     begin_s = time.time()
     loaded = load_profile(profile or DEFAULT_PROFILE)
@@ -95,7 +95,7 @@ def warm(
 @group.command("clear")
 def clear() -> None:
     """Remove all cached files; they are computed again when needed."""
-    from starid.cache import BYTES_PER_MB, cache_dir, cached_files, remove
+    from starid.storage.cache import BYTES_PER_MB, cache_dir, cached_files, remove
 
     files = cached_files()
     removed = [each for each in files if remove(each)]

@@ -232,7 +232,7 @@ def write_life(life: Any, violation: str, folder: Path) -> list[Path]:
 
 
 def _write(path: Path, text: str) -> None:
-    from starid.files import write_atomically
+    from starid.storage.files import write_atomically
 
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
 

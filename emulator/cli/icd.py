@@ -77,7 +77,7 @@ def export(
 
 def _write(path: Path, text: str) -> None:
     """Write a file atomically."""
-    from starid.files import write_atomically
+    from starid.storage.files import write_atomically
 
     with writing(path):
         write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))

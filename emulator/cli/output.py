@@ -19,7 +19,7 @@ PROGRESS_S: Final = 5.0
 
 async def report_slow_start() -> None:
     """Report the progress of a start on stderr every `PROGRESS_S`, until cancelled."""
-    from starid.cache import kernels_written_since
+    from starid.storage.cache import kernels_written_since
 
     begin_s = time.time()
     while True:
@@ -32,7 +32,7 @@ async def report_slow_start() -> None:
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Write the file of an option -o, whose folder is made; a failure is one line."""
-    from starid.files import removing_new_folders_on_error
+    from starid.storage.files import removing_new_folders_on_error
 
     with removing_new_folders_on_error(path.parent):
         prepare_output(path, "-o")

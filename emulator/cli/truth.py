@@ -59,8 +59,8 @@ def convert(
     from starhil.emulator.truth.csv_file import read_log
     from starhil.emulator.truth.file import read_truth_file
     from starhil.emulator.truth.spice_file import write_kernels
-    from starid.earth import unix_time
-    from starid.files import write_atomically
+    from starid.catalog.earth import unix_time
+    from starid.storage.files import write_atomically
 
     truth = read_log(source, measured=measured) if measured else read_truth_file(source)
     if truth.start_unix_s is None and date is None:

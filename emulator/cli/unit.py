@@ -66,7 +66,7 @@ def new(
     """Create a unit: a commented definition that already runs, as a starting point."""
     from starhil.emulator.errors import EmulatorError, explained
     from starhil.protocol.names import SKELETON
-    from starid.files import write_atomically
+    from starid.storage.files import write_atomically
 
     if folder.exists() and (not folder.is_dir() or any(folder.glob("*.toml"))):
         raise EmulatorError(f"{folder}: is a file, or contains TOML files; choose another folder")

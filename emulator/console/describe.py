@@ -20,7 +20,7 @@ from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.names import bundled
 from starid.catalog import load_catalog
-from starid.star_names import STAR_NAMES
+from starid.catalog.star_names import STAR_NAMES
 
 MAP_V: Final = 4.2
 """Magnitude of the faintest star on the map of the whole sky."""

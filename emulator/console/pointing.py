@@ -13,7 +13,7 @@ from starhil.emulator.truth.config import AttitudeConfig
 from starhil.protocol.validation_messages import problems
 from starid.attitude import Attitude
 from starid.catalog import load_catalog
-from starid.star_names import STAR_NAMES
+from starid.catalog.star_names import STAR_NAMES
 
 DEFAULT_RATE_DEG_S: Final = 0.5
 MAX_NUMBER: Final = 1e12

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from starhil.emulator.truth.orbit import EARTH_RADIUS_M, KeplerOrbit
 from starid.arrays import Array
-from starid.earth import earth_velocity
+from starid.catalog.earth import earth_velocity
 
 ParameterValue = bool | int | float | str
 

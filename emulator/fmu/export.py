@@ -16,7 +16,7 @@ from jinja2 import StrictUndefined, Template
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.fmu.variables import TEXT_SIZE, Fmi, Variable, variables
 from starhil.protocol.quoting import c_string
-from starid.files import write_atomically
+from starid.storage.files import write_atomically
 
 FOLDER: Final = Path(__file__).parent
 MODEL: Final = "startracker"

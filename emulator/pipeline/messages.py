@@ -67,7 +67,7 @@ class PipelineSetup:
     dark_frames: int = 0
     """Number of frames averaged into the dark frame that is subtracted from each image; 0: none."""
     calibration: list[list[float]] | None = None
-    """Covariance (9, 9) of the calibrated camera's parameters, as in `starid.calibration.Calibration`; None: they are
+    """Covariance (9, 9) of the calibrated camera's parameters, as in `starid.camera.calibration.Calibration`; None: they are
     exact."""
     images: dict[str, Any] = field(default_factory=dict)
     """Source of images instead of rendering: keys of `[images]` in a profile."""
@@ -219,7 +219,7 @@ class FrameResult:
     """The brightest identified stars, brightest first."""
     probability_false: float = 1.0
     rms_px: float = 0.0
-    """As in `starid.solution.Solution`."""
+    """As in `starid.identification.solution.Solution`."""
     index_pending: bool = False
     """Whether the frame was solved with the star index of earlier settings, because a new one is being built."""
     background_dn: float = 0.0

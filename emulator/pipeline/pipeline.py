@@ -43,16 +43,16 @@ from starhil.emulator.sensor.renderer import Frame, Renderer, frame_without_trut
 from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
-from starid.aberration import aberrated
 from starid.arrays import Array
 from starid.attitude import Attitude
-from starid.calibration import attitude_covariance
 from starid.camera import Camera
+from starid.camera.calibration import attitude_covariance
 from starid.catalog import load_catalog
+from starid.catalog.aberration import aberrated
 from starid.errors import StaridError
+from starid.identification.interface import StarIdentifier
+from starid.identification.solution import Reason, Solution
 from starid.imaging.detection import Detections, DetectionSettings, detect
-from starid.interface import StarIdentifier
-from starid.solution import Reason, Solution
 
 STARS_SENT: Final = 16
 """Number of identified stars returned to the device; the brightest ones."""

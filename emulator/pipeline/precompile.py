@@ -13,7 +13,7 @@ import sys
 from typing import Any
 
 from starhil.emulator.parent_death_signal import end_with_parent
-from starid.projection import back_project_kernel
+from starid.camera.projection import back_project_kernel
 
 
 def start_helper() -> subprocess.Popen[bytes] | None:
@@ -30,7 +30,7 @@ def main() -> None:
     """Compile kernels into the cache."""
     end_with_parent()
     gc.disable()  # compiling makes many objects and little garbage: collecting it takes an eighth of the time
-    from starid.geometric.identifier import Identifier
+    from starid.identification.geometric.identifier import Identifier
     from starid.imaging import pairs
 
     pairs.warm_up()

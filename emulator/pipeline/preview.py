@@ -32,8 +32,8 @@ from starhil.emulator.sky.objects import CelestialBody, Obstruction, SkyObjects
 from starid.arrays import Array, GreyImage, Indices32
 from starid.attitude import Attitude
 from starid.camera import Camera
+from starid.identification.solution import Solution
 from starid.imaging.detection import Detections
-from starid.solution import Solution
 
 JPEG_QUALITY: Final = 72
 FAINTEST_V: Final = 6.5

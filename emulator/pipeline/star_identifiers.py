@@ -22,10 +22,10 @@ from starhil.protocol.names import remedy
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.interface import ALGORITHMS, StarIdentifier, make_identifier
+from starid.identification.interface import ALGORITHMS, StarIdentifier, make_identifier
 
 if TYPE_CHECKING:
-    from starid.geometric.identifier import Identifier
+    from starid.identification.geometric.identifier import Identifier
 
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "float": (int, float),
@@ -56,7 +56,7 @@ class StarIdentifierSetup:
         check_options(self.algorithm, options)
         if self.algorithm != "geometric":
             return make_identifier(self.algorithm, self.camera, catalog, **options)
-        from starid.geometric.identifier import Effort, Identifier
+        from starid.identification.geometric.identifier import Effort, Identifier
 
         nominal = Effort()
         options["effort"] = replace(nominal, tolerance_px=nominal.tolerance_px * self.margin)

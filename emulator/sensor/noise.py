@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array32, GreyImage
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 
 LANES: Final = 512
 """Number of parallel random generators; pixels are processed in blocks of twice this size."""

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Array32
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 
 MAX_GAUSS_NODES: Final = 200
 MAX_NODES: Final = 20_000

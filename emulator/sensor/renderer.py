@@ -24,7 +24,8 @@ from starhil.emulator.sky.objects import PointSource, SkyObjects
 from starid.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.catalog import StarCatalog, companions
+from starid.catalog import StarCatalog
+from starid.catalog.catalog import companions
 
 __all__ = ["Frame", "Renderer", "SensorModel", "StarTruth", "render"]
 

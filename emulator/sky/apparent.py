@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from starid.arrays import Array
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 
 
 @compiled_ieee
@@ -24,7 +24,7 @@ def motion_at(cubics: Array, share: float, slot_s: float) -> Array:
 
 @inner
 def _aberrate(x: float, y: float, z: float, beta: Array, inverse_gamma: float, out: Array) -> None:
-    """As `starid.aberration.aberrated`, for one direction."""
+    """As `starid.catalog.aberration.aberrated`, for one direction."""
     along = x * beta[0] + y * beta[1] + z * beta[2]
     share, total = 1.0 + along / (1.0 + inverse_gamma), 1.0 + along
     out[0] = (inverse_gamma * x + share * beta[0]) / total

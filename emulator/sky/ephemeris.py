@@ -18,9 +18,9 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.sky.objects import CelestialBody, EarthLimb, Moon, PointSource, SunGlare
-from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated, checked_beta
 from starid.arrays import Array
-from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, in_metres, terrestrial_time
+from starid.catalog.aberration import SPEED_OF_LIGHT_M_S, aberrated, checked_beta
+from starid.catalog.earth import ASTRONOMICAL_UNIT_M, DAY_S, in_metres, terrestrial_time
 
 Vector = Array
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array32
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 
 Image = Array32
 

@@ -10,7 +10,7 @@ import numpy as np
 from starhil.emulator.sky.light_grid import GLARE_STEP, Image, Line, Sensitivity, expand
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS
 from starid.arrays import Array, Array32
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 
 Glare: TypeAlias = tuple[Array32, float, float, bool]
 """Direction of a source in the sensor frame, strength, square of the softness, and whether it falls with the cube."""

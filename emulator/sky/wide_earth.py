@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, Sensitivity, expand
 from starid.arrays import Array, Array32, Indices32
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 
 GLOW_HEIGHTS: Final = 20.0
 """Heights of the atmosphere above the limb up to which it glows."""

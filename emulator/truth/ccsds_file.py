@@ -39,7 +39,7 @@ from starhil.emulator.truth.standard_frames import (
 from starhil.emulator.truth.table import FileTruth, OrbitTable
 from starid.arrays import Array
 from starid.attitude import Attitude
-from starid.files import read_number
+from starid.storage.files import read_number
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

@@ -31,7 +31,7 @@ from starhil.emulator.truth.source import (
     TruthSource,
 )
 from starid.attitude import Attitude
-from starid.earth import LATEST_UNIX_S, unix_time
+from starid.catalog.earth import LATEST_UNIX_S, unix_time
 
 AxisRate: TypeAlias = Annotated[float, Field(ge=-MAX_RATE_DEG_S, le=MAX_RATE_DEG_S)]
 Rate: TypeAlias = Annotated[list[AxisRate], Field(min_length=3, max_length=3)]

@@ -32,7 +32,7 @@ from starhil.emulator.truth.plausibility import doubt_of_orbit
 from starhil.emulator.truth.source import MAX_RATE_DEG_S
 from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude, rate_between
-from starid.files import read_number
+from starid.storage.files import read_number
 
 QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
 ANGLE_COLUMNS: Final = ("ra_deg", "dec_deg", "roll_deg")

@@ -34,7 +34,7 @@ from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import MAX_RATE_DEG_S, Vector
 from starid.attitude import Attitude
-from starid.earth import LATEST_UNIX_S
+from starid.catalog.earth import LATEST_UNIX_S
 
 NORM_TOLERANCE: Final = 0.01
 """Largest error of the length of a quaternion that is attributed to rounding."""

@@ -24,7 +24,7 @@ from starhil.emulator.truth.csv_file import read_csv
 from starhil.emulator.truth.spice_file import META_KERNEL, read_kernels
 from starhil.emulator.truth.stk_file import STK, read_attitude, read_ephemeris
 from starhil.emulator.truth.table import FileTruth, OrbitTable
-from starid.files import MEGABYTE, read_text
+from starid.storage.files import MEGABYTE, read_text
 
 MAX_BYTES: Final = 500 * MEGABYTE
 """Maximum size of a truth file: a day at 50 rows per second."""

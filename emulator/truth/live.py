@@ -38,7 +38,8 @@ from starhil.emulator.truth.plausibility import doubt_of_date, doubt_of_orbit
 from starhil.emulator.truth.sender_clock import SenderClock, SenderSpeed
 from starhil.emulator.truth.simulator_42 import Format42
 from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus
-from starid.attitude import Attitude, interpolate, interpolate_with_rates, propagate
+from starid.attitude import Attitude, interpolate, propagate
+from starid.attitude.attitude import interpolate_with_rates
 
 log = logging.getLogger("starhil.truth")
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starid.arrays import Array
-from starid.earth import DAY_S, UNIX_EPOCH_JD, terrestrial_time
+from starid.catalog.earth import DAY_S, UNIX_EPOCH_JD, terrestrial_time
 
 Vector: TypeAlias = Array
 

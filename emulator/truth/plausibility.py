@@ -14,7 +14,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from starhil.emulator.truth.orbit import EARTH_GM_M3_S2, OrbitState
-from starid.earth import DAY_S
+from starid.catalog.earth import DAY_S
 
 SURFACE_M: Final = 6.35e6
 """Distance from the Earth's centre below which nothing flies: the poles are at 6357 km."""

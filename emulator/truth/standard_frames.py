@@ -22,7 +22,7 @@ from starhil.emulator.truth.source import Vector
 from starhil.emulator.truth.table import FileTruth, OrbitTable, Span
 from starid.arrays import Array
 from starid.attitude import Attitude
-from starid.earth import utc_of_tai
+from starid.catalog.earth import utc_of_tai
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation

@@ -16,7 +16,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.ccsds_file import Segment, attitudes_of, orbit_of
 from starhil.emulator.truth.standard_frames import NANOSECONDS, unix_ns
 from starhil.emulator.truth.table import FileTruth, OrbitTable
-from starid.files import read_number
+from starid.storage.files import read_number
 
 STK: Final = "stk.v."
 MAX_SECONDS: Final = 1e9

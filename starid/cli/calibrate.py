@@ -50,7 +50,7 @@ def command(
     The exit status is 1 if an image could not be identified; the profile is then based on the others.
     """
     from starid.camera import Camera
-    from starid.camera_file import save_camera
+    from starid.camera.file import save_camera
     from starid.catalog import DEFAULT_EPOCH, load_catalog
     from starid.photograph.self_calibration import self_calibrate
 

@@ -56,8 +56,8 @@ def build(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from starid.thesis.database import build_database
-    from starid.thesis.database_file import save_database
+    from starid.identification.thesis.database import build_database
+    from starid.identification.thesis.database_file import save_database
 
     if output is not None:
         prepare_output(output, "-o")
@@ -100,7 +100,7 @@ def info(file: Annotated[Path, typer.Argument(help="Database file.")], as_json: 
     """Verify a database file and show the parameters it was built with."""
     import dataclasses
 
-    from starid.thesis.database_file import load_database
+    from starid.identification.thesis.database_file import load_database
 
     database = load_database(file)
     _print(

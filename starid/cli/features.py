@@ -50,7 +50,7 @@ def command(
     as_json: AsJson = False,
 ) -> None:
     """Print the feature vector (n, A, r, sigma_A, sigma_r) and polar angle theta (°) of a patch of the sky."""
-    from starid.thesis.database import sky_of
+    from starid.identification.thesis.database import sky_of
 
     parameters = frame_parameters(
         geometry, fov=fov, kappa=kappa, direction=direction, band=band, full_field=full_field

@@ -11,8 +11,8 @@ from starid.errors import StaridError
 
 if TYPE_CHECKING:
     from starid.catalog import Band, StarCatalog
-    from starid.thesis.database import DatabaseParameters
-    from starid.thesis.frame_sky import Direction
+    from starid.identification.thesis.database import DatabaseParameters
+    from starid.identification.thesis.frame_sky import Direction
 
 Geometry: TypeAlias = Annotated[
     str,
@@ -69,7 +69,7 @@ def frame_parameters(
 ) -> DatabaseParameters:
     """Return frame parameters from command-line options; None stands for the default of the geometry."""
     from starid.camera import Camera
-    from starid.thesis.database import DatabaseParameters
+    from starid.identification.thesis.database import DatabaseParameters
 
     planar = one_of("--geometry", geometry, ("planar", "spherical")) == "planar"
     limit = (11.5 if planar else 5.0) if kappa is None else kappa

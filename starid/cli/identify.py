@@ -106,7 +106,7 @@ def command(
     estimated. The exit status is 1 if the stars cannot be identified.
     """
     from starid.catalog import DEFAULT_EPOCH, load_catalog
-    from starid.earth import julian_year
+    from starid.catalog.earth import julian_year
     from starid.imaging.image_io import image_suffix, read_image, write_image
 
     if output is not None:
@@ -147,9 +147,9 @@ def _solve(
 ) -> ImageSolution:
     """Solve an image with the camera that the options select."""
     from starid.camera import Camera
-    from starid.files import read_number
     from starid.photograph.field_sweep import solve_any_field
     from starid.photograph.solver import solve_image
+    from starid.storage.files import read_number
 
     if fov is None:
         return solve_image(pixels, _camera(profile), catalog, observer_velocity=observer_velocity)
@@ -204,7 +204,7 @@ class _Progress:
 
 def _unix_time(date: str) -> float:
     """Return the Unix time of `--date`."""
-    from starid.earth import unix_time
+    from starid.catalog.earth import unix_time
 
     try:
         return unix_time(date)
@@ -216,8 +216,8 @@ def _velocity(unix_s: float | None, given: str | None) -> NDArray[np.float64] | 
     """Return the barycentric velocity of the camera, m/s; None if neither date nor velocity is given."""
     import numpy as np
 
-    from starid.earth import earth_velocity
-    from starid.files import read_number
+    from starid.catalog.earth import earth_velocity
+    from starid.storage.files import read_number
 
     velocity: NDArray[np.float64] | None = None if unix_s is None else earth_velocity(unix_s)
     if given is None:
@@ -235,7 +235,7 @@ def _velocity(unix_s: float | None, given: str | None) -> NDArray[np.float64] | 
 def _camera(profile: str | None) -> Camera:
     """Return the camera of a profile, or the emulator's default."""
     from starid.camera import Camera
-    from starid.camera_file import load_camera
+    from starid.camera.file import load_camera
 
     if profile is None:
         return Camera.from_fov()
@@ -294,8 +294,8 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
     if not solution.valid:
         return report
     from starid.catalog import load_catalog
-    from starid.missing import missing_stars
-    from starid.star_names import STAR_NAMES
+    from starid.catalog.star_names import STAR_NAMES
+    from starid.identification.missing import missing_stars
 
     attitude = solution.attitude
     missing = missing_stars(solution, result.camera, result.stars, found.xy_px)

@@ -87,7 +87,7 @@ def prepare_folder(path: Path, option: str) -> None:
 
 def report_stream(output: Path | None) -> TextIO:
     """Return the stream for the report of a command: stderr if its output file is stdout, or else stdout."""
-    from starid.files import is_stdout
+    from starid.storage.files import is_stdout
 
     return sys.stderr if output is not None and is_stdout(output) else sys.stdout
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array32, GreyImage
-from starid.jit import compiled_ieee, compiled_sums
+from starid.kernels.jit import compiled_ieee, compiled_sums
 
 BLOCK_PX: Final = 32
 """Side of a block, pixels: stars cover about 1 % of it, and stray light is nearly plane within it."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from starid.arrays import Array, Array32, record_type
 from starid.imaging.normal_table import normal, quick_normal
-from starid.jit import compiled_ieee, compiled_sums
+from starid.kernels.jit import compiled_ieee, compiled_sums
 
 UNUSABLE: Final = 1e9
 """Least count at which a pixel of a window has no weight: saturated and masked pixels are set to infinity."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from starid.arrays import GreyImage
 from starid.errors import StaridError
-from starid.files import MEGABYTE, is_stream, read_bytes, write_atomically
+from starid.storage.files import MEGABYTE, is_stream, read_bytes, write_atomically
 
 IMAGE_LIMIT: Final = 1000 * MEGABYTE
 """Largest image file that is read, bytes: a 16-bit colour TIFF of the largest cameras has about 900 MB."""

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from starid.arrays import Array32, GreyImage, Indices32
 from starid.imaging.background import block_position
-from starid.jit import compiled_ieee, compiled_sums
+from starid.kernels.jit import compiled_ieee, compiled_sums
 
 INTEGER_TAPS_SUM: Final = 16
 """Sum of the integer filter's taps along one axis, so that a byte smoothed along both axes fits 16 bits."""

@@ -23,8 +23,8 @@ from starid.imaging.centroid import (
     star_model,
 )
 from starid.imaging.windows import Window
-from starid.jit import compiled_ieee
-from starid.small_arrays import copy_values
+from starid.kernels.jit import compiled_ieee
+from starid.kernels.small_arrays import copy_values
 
 SATURATED, AT_EDGE = 1, 2
 """Bits of a star's flags."""

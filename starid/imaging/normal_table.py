@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 
 REACH: Final = 8.0
 """Beyond this many standard deviations the distribution is taken as 0 or 1."""

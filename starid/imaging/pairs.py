@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Array32, Indices, Indices32, Mask, Records
+from starid.catalog.photometry import EVEN_PAIR
 from starid.imaging.centroid import (
     FIT,
     GOOD,
@@ -16,9 +17,8 @@ from starid.imaging.centroid import (
     star_model,
 )
 from starid.imaging.windows import WINDOW, Window
-from starid.jit import compiled_ieee
-from starid.photometry import EVEN_PAIR
-from starid.small_arrays import copy_values
+from starid.kernels.jit import compiled_ieee
+from starid.kernels.small_arrays import copy_values
 
 _UNKNOWNS: Final = 6
 _ITERATIONS: Final = 25
@@ -263,7 +263,7 @@ def doubt_close_pairs(stars: Records, order: Indices, blend_px: float) -> None:
 def _merge(pair: Records, blend_px: float, star: Fit) -> None:
     """Replace two stars by one with their total light, at the position and with the errors of a single-spot fit.
 
-    The position follows `starid.photometry.fitted_share`, so that resolved and unresolved pairs agree with an index
+    The position follows `starid.catalog.photometry.fitted_share`, so that resolved and unresolved pairs agree with an index
     of merged stars.
     """
     faint = 1 if pair[1].flux < pair[0].flux else 0

@@ -10,7 +10,7 @@ import numpy as np
 from starid.arrays import Array, Array32, GreyImage, Indices32
 from starid.imaging.background import interpolate_at
 from starid.imaging.centroid import FIT, GOOD, Fit, fit_star, spot_model
-from starid.jit import compiled_ieee
+from starid.kernels.jit import compiled_ieee
 
 NARROWEST_PX: Final = 0.25
 WIDEST_PX: Final = 8.0

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from starid.arrays import Array, GreyImage
 from starid.imaging.matched_filter import spot_taps
 from starid.imaging.trail_flow import trail_at
-from starid.jit import compiled_ieee
+from starid.kernels.jit import compiled_ieee
 
 _TILE_COLUMNS: Final = 128
 _TILE_ROWS: Final = 32

@@ -16,8 +16,8 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array
-from starid.jit import compiled_ieee
-from starid.small_arrays import copy_values, median
+from starid.kernels.jit import compiled_ieee
+from starid.kernels.small_arrays import copy_values, median
 
 FLOW_TERMS: Final = 5
 _TRANSLATION: Final = 2

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from starid.arrays import Array, Array32, GreyImage, Indices32, Records, record_type
 from starid.imaging.background import MIN_NOISE_DN, interpolate_at
 from starid.imaging.trail_flow import trail_at
-from starid.jit import compiled_ieee
+from starid.kernels.jit import compiled_ieee
 
 
 class Window(Protocol):

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array, Indices, Mask
-from starid.thesis.false_stars import ObservedFrame
-from starid.thesis.frame_sky import FrameSky, SkyError
+from starid.identification.thesis.false_stars import ObservedFrame
+from starid.identification.thesis.frame_sky import FrameSky, SkyError
 
 PIXEL_DEG: Final = 42.0 / 937.0
 """Width of a pixel, degrees, eq. 5.2: a field of 42° on 937 pixels."""

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from starid.catalog.star_names import STAR_NAMES
 from starid.imaging.background import estimate_background
-from starid.star_names import STAR_NAMES
 
 MARK_BGR: Final = (70, 190, 105)
 MISS_BGR: Final = (70, 90, 240)

@@ -20,9 +20,9 @@ from starid.arrays import Array
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.geometric.identifier import Effort, Identifier, scaled_camera
+from starid.identification.geometric.identifier import Effort, Identifier, scaled_camera
+from starid.identification.solution import Reason, Solution
 from starid.photograph.typical_camera import typical_camera
-from starid.solution import Reason, Solution
 
 SIZE_PX: Final = 1000.0
 """Side of the image for which the windows are defined; they scale with the side."""

@@ -16,7 +16,8 @@ import numpy as np
 
 from starid.arrays import Array, Indices
 from starid.attitude import Attitude
-from starid.calibration import (
+from starid.camera import Camera
+from starid.camera.calibration import (
     DEFAULT_ESTIMATE,
     GROUPS,
     Calibration,
@@ -24,11 +25,11 @@ from starid.calibration import (
     calibrate,
     check_estimate,
 )
-from starid.camera import Camera
-from starid.catalog import StarCatalog, close_pairs, load_catalog, merge_close_stars
+from starid.catalog import StarCatalog, load_catalog
+from starid.catalog.catalog import close_pairs, merge_close_stars
 from starid.errors import StaridError
+from starid.identification.solution import Solution
 from starid.photograph.rough_search import RoughSearch
-from starid.solution import Solution
 
 MODELS: Final[tuple[tuple[str, ...], ...]] = (
     ("focal",),
@@ -105,7 +106,7 @@ def self_calibrate(
     fov_tolerance : float
         Relative uncertainty of the start camera's focal length.
     estimate : sequence of str, optional
-        Free parameters (see `starid.calibration.GROUPS`); by default the set of `models` with the least
+        Free parameters (see `starid.camera.calibration.GROUPS`); by default the set of `models` with the least
         Bayesian information criterion (BIC).
     models : sequence of tuple of str
         Sets to choose from when `estimate` is not given.

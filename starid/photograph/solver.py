@@ -18,13 +18,13 @@ from starid.arrays import Array, GreyImage
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.geometric.answer import MIN_MATCHED
-from starid.geometric.identifier import Identifier
+from starid.identification.geometric.answer import MIN_MATCHED
+from starid.identification.geometric.identifier import Identifier
+from starid.identification.solution import Reason, Solution
 from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.photograph.rough_search import RoughSearch
 from starid.photograph.self_calibration import IMAGE_MODELS, Stars, calibrate_identified
 from starid.photograph.views import View, views
-from starid.solution import Reason, Solution
 
 _log = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ def solve_image(
     settings : DetectionSettings, optional
         Settings of the detection.
     observer_velocity : array (3,), optional
-        See `starid.interface.StarIdentifier.identify`.
+        See `starid.identification.interface.StarIdentifier.identify`.
     time_limit_s, progress
         With a `fov_tolerance`, see `search_views`.
 
@@ -151,7 +151,7 @@ def search_views(
     search_for : callable
         Returns the search for a camera; it is called again for each round and view.
     observer_velocity : array (3,), optional
-        See `starid.interface.StarIdentifier.identify`.
+        See `starid.identification.interface.StarIdentifier.identify`.
     time_limit_s : float
         Time after which the search is given up. Compiling kernels and building indices, which is done once, does
         not count.
@@ -224,7 +224,7 @@ def refine_solution(
     begin : float
         Value of the performance counter at the start.
     observer_velocity : array (3,), optional
-        See `starid.interface.StarIdentifier.identify`.
+        See `starid.identification.interface.StarIdentifier.identify`.
     """
     identifier = search.identifier
     found = view.detections

@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from starid.camera import Camera
-from starid.geometric.pattern_index import field_solid_angle
+from starid.identification.geometric.pattern_index import field_solid_angle
 
 FIELD_STEP: Final = 1.2
 """Ratio of the widths of two adjacent typical fields."""

@@ -25,7 +25,7 @@ main()
 BLAS = """
 import sys
 import numpy as np
-import starid.kernel_library
+import starid.kernels.compiler
 from numba import njit
 print("scipy.linalg" in sys.modules)
 @njit

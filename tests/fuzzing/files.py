@@ -31,11 +31,11 @@ from starhil.protocol.export import FORMATS, export
 from starhil.protocol.icd import load_unit
 from starhil.protocol.serial_stack import SerialStack
 from starid.attitude import Attitude
-from starid.camera_file import load_camera
-from starid.hipparcos import read_hip2
+from starid.camera.file import load_camera
+from starid.catalog.hipparcos import read_hip2
+from starid.identification.thesis.database_file import MAGIC, load_database
 from starid.imaging.image_io import read_image
-from starid.result_store import read_results
-from starid.thesis.database_file import MAGIC, load_database
+from starid.storage.results import read_results
 from tests.emulator.conftest import Bench
 from tests.fuzzing.edits import edited, toml
 from tests.fuzzing.target import ATTITUDE, NESTED, TARGETS, Run, Target, target

@@ -25,7 +25,7 @@ from starhil.protocol.user_file import (
     read_user_file,
     read_user_text,
 )
-from starid.camera_file import load_camera
+from starid.camera.file import load_camera
 from starid.errors import StaridError
 
 READERS = {

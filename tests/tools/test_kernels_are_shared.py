@@ -8,9 +8,9 @@ import sys
 
 import pytest
 
-from starid.cache import cache_dir
+from starid.storage.cache import cache_dir
 
-SHOW = [sys.executable, "-c", "from starid.cache import cache_dir; print(cache_dir())"]
+SHOW = [sys.executable, "-c", "from starid.storage.cache import cache_dir; print(cache_dir())"]
 
 
 def test_a_process_with_another_home_uses_the_kernels_of_this_run(tmp_path):

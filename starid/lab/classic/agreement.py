@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices
+from starid.attitude.wahba import solve_wahba
 from starid.errors import StaridError
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.pairs import chord_between
-from starid.wahba import solve_wahba
 
 MIN_GROUP: Final = 3
 """Smallest group that is accepted: chance produces any number of pairs."""

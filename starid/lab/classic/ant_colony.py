@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Array32, Indices
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.neighbours import neighbours_of
 from starid.lab.classic.pairs import chord_between
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed

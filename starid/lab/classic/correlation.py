@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Array32, Indices, Indices32
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.grid import BUFFER_SHARE, RADIUS_SHARE
 from starid.lab.classic.neighbours import aligned_neighbours, nearest_beyond, neighbour_table
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed

@@ -27,7 +27,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from starid.arrays import Array, Indices
-from starid.jit import compiled_ieee
+from starid.kernels.jit import compiled_ieee
 from starid.lab.classic.grid import (
     BUFFER_SHARE,
     GRID,

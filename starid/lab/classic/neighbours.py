@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Array32, Indices, Indices32
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 
 MAX_TIED: Final = 4
 """Most guide stars with equal votes that a pivot may pass to the last step; more are not significant."""

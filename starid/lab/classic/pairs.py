@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from starid.arrays import Array, Array32, Indices, Indices32
 from starid.errors import StaridError
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 
 MAX_STARS: Final = 65_535
 """Largest number of stars: their rows are stored in 16 bits."""

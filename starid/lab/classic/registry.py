@@ -5,10 +5,10 @@ from __future__ import annotations
 import importlib
 from typing import Any, Final, cast
 
-from starid import interface
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
-from starid.interface import StarIdentifier
+from starid.identification import interface
+from starid.identification.interface import StarIdentifier
 
 CLASSICS: Final = (
     "pyramid",

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices32
-from starid.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.neighbours import grouped, neighbours_of
 
 RINGS: Final = 200

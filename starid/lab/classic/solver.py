@@ -30,18 +30,18 @@ from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices
 from starid.attitude import Attitude
+from starid.attitude.wahba import covariance, solve_wahba
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.geometric.identifier import Identifier
-from starid.geometric.index_choice import pixels_per_radian
-from starid.geometric.pattern_index import field_solid_angle, resolved_stars
-from starid.geometric.pattern_stars import select_pattern_stars
-from starid.geometric.verified import VerifiedIdentifier
+from starid.identification.geometric.identifier import Identifier
+from starid.identification.geometric.index_choice import pixels_per_radian
+from starid.identification.geometric.pattern_index import field_solid_angle, resolved_stars
+from starid.identification.geometric.pattern_stars import select_pattern_stars
+from starid.identification.geometric.verified import VerifiedIdentifier
+from starid.identification.single_camera import CheckedDetections
+from starid.identification.solution import Reason, Solution
 from starid.lab.classic.agreement import MIN_GROUP, largest_group
-from starid.single_camera import CheckedDetections
-from starid.solution import Reason, Solution
-from starid.wahba import covariance, solve_wahba
 
 Database = tuple[NDArray[np.generic], ...]
 

@@ -24,12 +24,12 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices
+from starid.attitude.wahba import solve_wahba
 from starid.errors import StaridError
-from starid.jit import compiled_ieee
+from starid.kernels.jit import compiled_ieee
 from starid.lab.classic.agreement import group_around
 from starid.lab.classic.pairs import PairTable, pair_table, pole_partners
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
-from starid.wahba import solve_wahba
 
 POLES: Final = 10
 GROUPS: Final = 8

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.identification.thesis.metrics import boresight_error
 from starid.lab.classic.registry import CLASSICS, class_of, make_identifier
 from starid.lab.experiments.classics_sky import SkyName, ThesisSky, thesis_sky
 from starid.lab.experiments.experiment import Context, Evaluation, Parameters, Part, Results
@@ -18,7 +19,6 @@ from starid.lab.experiments.lsi_noise import IDENTIFIED_DEG
 from starid.lab.experiments.lsi_trials import centres, error_of, share, stars_of
 from starid.lab.experiments.tables import published, read_lines
 from starid.lab.simulation import NoiseModel
-from starid.thesis.metrics import boresight_error
 
 _COMPETITORS: Final = {line["name"]: line for line in read_lines("competitors.csv")}
 
@@ -89,7 +89,7 @@ def _distance(sky: SkyName, found: tuple[float, float], true: tuple[float, float
 
 def _lsi(context: Context, rng: np.random.Generator, frames: Array, noise: NoiseModel) -> tuple[Array, Array]:
     """The same of the thesis's algorithm on its flat sky."""
-    from starid.thesis.features import extract_features
+    from starid.identification.thesis.features import extract_features
 
     lsi = context.lost_in_space(0.995)
     errors, times = np.empty((2, len(frames)))

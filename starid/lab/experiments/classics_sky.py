@@ -19,10 +19,10 @@ from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
+from starid.identification.thesis.database import THESIS_KAPPA, DatabaseParameters, sky_of
+from starid.identification.thesis.frame_sky import FrameSky
 from starid.lab.experiments.experiment import planar_sky, star_catalog
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, add_noise
-from starid.thesis.database import THESIS_KAPPA, DatabaseParameters, sky_of
-from starid.thesis.frame_sky import FrameSky
 
 SkyName = Literal["flat", "sphere"]
 

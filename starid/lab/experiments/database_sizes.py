@@ -20,9 +20,9 @@ _THREADS: Final = 2
 
 def compute(context: Context, part: Part) -> Results:
     """Number of cells of a database, and time and size if it is built."""
-    from starid.thesis.database import DatabaseParameters, build_database
-    from starid.thesis.database_file import save_database
-    from starid.thesis.frame_grid import make_grid
+    from starid.identification.thesis.database import DatabaseParameters, build_database
+    from starid.identification.thesis.database_file import save_database
+    from starid.identification.thesis.frame_grid import make_grid
 
     overlap = part["percent"] / 100.0
     parameters = DatabaseParameters(overlap=overlap)
@@ -53,7 +53,7 @@ def _inclusive_cells(percent: float) -> float:
 
 def evaluate(e: Evaluation) -> None:
     """Numbers and sizes for each overlap; bounds on the time and the file of the largest database."""
-    from starid.thesis.frame_grid import minimum_overlap, nominal_cells
+    from starid.identification.thesis.frame_grid import minimum_overlap, nominal_cells
 
     e.compare("p_min, eq. 2.27", printed=minimum_overlap())
     lines = []

@@ -22,7 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.catalog import StarCatalog, load_catalog
-from starid.hipparcos import EPOCH
+from starid.catalog.hipparcos import EPOCH
+from starid.identification.thesis.database import DatabaseParameters, FeatureDatabase, build_database, sky_of
+from starid.identification.thesis.database_file import load_database, save_database
+from starid.identification.thesis.frame_sky import FrameSky
+from starid.identification.thesis.lsi import LostInSpace, Solver
 from starid.lab.experiments.comparison import (
     Outcome,
     Published,
@@ -34,10 +38,6 @@ from starid.lab.experiments.comparison import (
 )
 from starid.lab.experiments.figures import Curve, Panel, Picture, draw
 from starid.lab.experiments.tables import COLUMNS, PUBLISHED, published
-from starid.thesis.database import DatabaseParameters, FeatureDatabase, build_database, sky_of
-from starid.thesis.database_file import load_database, save_database
-from starid.thesis.frame_sky import FrameSky
-from starid.thesis.lsi import LostInSpace, Solver
 
 Results = dict[str, NDArray[Any]]
 """Results of a part: named arrays."""

@@ -30,7 +30,7 @@ _MAPS: Final = {
 
 def _features(centres: Array, kappa: float) -> Array:
     """Features and θ (degrees) of frames, (n, 6); NaN for a frame without stars."""
-    from starid.thesis.frame_sky import cell_features
+    from starid.identification.thesis.frame_sky import cell_features
 
     sky = planar_sky(kappa=kappa, fov_deg=FRAME_DEG)
     table = np.full((len(centres), 6), np.nan)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from starid.plots import colours, figure, save
+from starid.storage.plots import colours, figure, save
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,12 +8,9 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Mask
-from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
-from starid.lab.experiments.figures import Curve, plane_axes
-from starid.lab.simulation import PIXEL_DEG, turned
-from starid.thesis.cme import matched_motion
-from starid.thesis.false_stars import ObservedFrame
-from starid.thesis.fsf import (
+from starid.identification.thesis.cme import matched_motion
+from starid.identification.thesis.false_stars import ObservedFrame
+from starid.identification.thesis.fsf import (
     EPSILON,
     MIN_SAMPLES_SHARE,
     ClusterFilter,
@@ -23,6 +20,9 @@ from starid.thesis.fsf import (
     pair_count,
     pairs_of,
 )
+from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
+from starid.lab.experiments.figures import Curve, plane_axes
+from starid.lab.simulation import PIXEL_DEG, turned
 
 _FIELD_DEG: Final = 42.0
 _STARS: Final = 6

@@ -10,19 +10,19 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Mask
+from starid.identification.thesis.cme import CameraMotion, matched_motion
+from starid.identification.thesis.false_stars import ObservedFrame
+from starid.identification.thesis.fsf import ClusterFilter
+from starid.identification.thesis.matlab_filter import MatlabFilter
+from starid.identification.thesis.metrics import Confusion
+from starid.identification.thesis.scalable_filter import TrackFilter, TrackFilterSettings
 from starid.lab.experiments.author_noise import FILTER_MAGNITUDES, filter_noise
 from starid.lab.experiments.comparison import best_constant
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.experiments.figures import Curve
 from starid.lab.experiments.tables import CONFUSION
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, SimulatedFrame, moved_frames
-from starid.plots import colours
-from starid.thesis.cme import CameraMotion, matched_motion
-from starid.thesis.false_stars import ObservedFrame
-from starid.thesis.fsf import ClusterFilter
-from starid.thesis.matlab_filter import MatlabFilter
-from starid.thesis.metrics import Confusion
-from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
+from starid.storage.plots import colours
 
 RADIUS_DEG: Final = 21.0
 """Radius of the circular field of these experiments, degrees."""

@@ -8,6 +8,13 @@ from typing import Final
 
 import numpy as np
 
+from starid.identification.thesis.cme import estimate_motion, matched_motion
+from starid.identification.thesis.false_stars import ObservedFrame
+from starid.identification.thesis.fsf import ClusterFilter
+from starid.identification.thesis.matlab_filter import MatlabFilter
+from starid.identification.thesis.metrics import Confusion
+from starid.identification.thesis.rsi import correlation
+from starid.identification.thesis.scalable_filter import TrackFilter, TrackFilterSettings
 from starid.lab.experiments.author_noise import filter_noise
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
 from starid.lab.experiments.figures import Curve, Panel, curves_of, plane_axes
@@ -20,13 +27,6 @@ from starid.lab.experiments.fsf import (
 )
 from starid.lab.experiments.tables import CASE_STUDY
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, turned
-from starid.thesis.cme import estimate_motion, matched_motion
-from starid.thesis.false_stars import ObservedFrame
-from starid.thesis.fsf import ClusterFilter
-from starid.thesis.matlab_filter import MatlabFilter
-from starid.thesis.metrics import Confusion
-from starid.thesis.rsi import correlation
-from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
 
 _SPREAD_DEG: Final = 0.1
 _CASE_FRAMES: Final = 10

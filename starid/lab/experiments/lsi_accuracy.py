@@ -9,11 +9,11 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.identification.thesis.metrics import error_colours
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
 from starid.lab.experiments.figures import Picture, precision, precision_axes
 from starid.lab.experiments.lsi_trials import COLUMNS, GRID_LABELS, OFF, ON, ROWS, share, shares, solve_frames
-from starid.plots import colours
-from starid.thesis.metrics import error_colours
+from starid.storage.plots import colours
 
 _LIMITS: Final = (0.3, 0.2, 0.1, 0.013, 0.008, 0.002)
 _MAP_SCALES: Final = (0.1, 1.0)

@@ -40,10 +40,10 @@ def _milliseconds(count: int, work: Callable[[int], object]) -> Array:
 
 def compute(context: Context, part: Part) -> Results:
     """Times of each stage, (n,) ms."""
-    from starid.thesis.features import extract_features
-    from starid.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
-    from starid.thesis.lsi import estimate_from_path, fill_dictionary, lsi_work
-    from starid.thesis.subcell import SubcellSearch
+    from starid.identification.thesis.features import extract_features
+    from starid.identification.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
+    from starid.identification.thesis.lsi import estimate_from_path, fill_dictionary, lsi_work
+    from starid.identification.thesis.subcell import SubcellSearch
 
     lsi = context.lost_in_space(part["percent"] / 100.0)
     fine = SubcellSearch(lsi)

@@ -9,13 +9,13 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.identification.thesis.features import extract_features
+from starid.identification.thesis.frame_sky import FrameSky
+from starid.identification.thesis.lsi import LsiEstimate
+from starid.identification.thesis.metrics import boresight_error, rotation_error
+from starid.identification.thesis.subcell import FineEstimate, SubcellSearch
 from starid.lab.experiments.experiment import Context, Results
 from starid.lab.simulation import NoiseModel, add_noise, turned
-from starid.thesis.features import extract_features
-from starid.thesis.frame_sky import FrameSky
-from starid.thesis.lsi import LsiEstimate
-from starid.thesis.metrics import boresight_error, rotation_error
-from starid.thesis.subcell import FineEstimate, SubcellSearch
 
 COLUMNS: Final = 63
 """Number of test frames in right ascension, with corners at α = 2° + 5°·k."""

@@ -11,14 +11,14 @@ from typing import Final
 
 import numpy as np
 
+from starid.identification.thesis.database_file import load_database
+from starid.identification.thesis.lsi import LostInSpace
+from starid.identification.thesis.rsi import RecursiveIdentification, RsiSettings
+from starid.identification.thesis.scalable_filter import TrackFilter
 from starid.lab.experiments.comparison import ReproduceError
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
 from starid.lab.experiments.rsi_trials import START
 from starid.lab.simulation import NoiseModel, sky_sequence
-from starid.thesis.database_file import load_database
-from starid.thesis.lsi import LostInSpace
-from starid.thesis.rsi import RecursiveIdentification, RsiSettings
-from starid.thesis.scalable_filter import TrackFilter
 
 _LIMIT_MB: Final = 400.0
 

@@ -9,6 +9,14 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.identification.thesis.cme import matched_motion
+from starid.identification.thesis.database import DatabaseParameters, build_database
+from starid.identification.thesis.false_stars import ObservedFrame
+from starid.identification.thesis.features import FeatureError, FeatureVector, extract_features
+from starid.identification.thesis.fsf import ClusterFilter
+from starid.identification.thesis.lsi import LostInSpace
+from starid.identification.thesis.metrics import boresight_error
+from starid.identification.thesis.missing_stars import DividedField, restore_missing
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.experiments.lsi_trials import (
     HALF_FRAME_DEG,
@@ -21,14 +29,6 @@ from starid.lab.experiments.lsi_trials import (
 )
 from starid.lab.experiments.rsi_trials import START
 from starid.lab.simulation import NoiseModel, add_noise, sky_sequence
-from starid.thesis.cme import matched_motion
-from starid.thesis.database import DatabaseParameters, build_database
-from starid.thesis.false_stars import ObservedFrame
-from starid.thesis.features import FeatureError, FeatureVector, extract_features
-from starid.thesis.fsf import ClusterFilter
-from starid.thesis.lsi import LostInSpace
-from starid.thesis.metrics import boresight_error
-from starid.thesis.missing_stars import DividedField, restore_missing
 
 _OVERLAP: Final = 0.995
 _FRAME_DEG: Final = 24.0

@@ -6,10 +6,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from starid.files import write_atomically
 from starid.lab.experiments.comparison import Row
 from starid.lab.experiments.runner import FinishedExperiment
 from starid.lab.experiments.tables import class_of, known_miss, numbers_by_choice
+from starid.storage.files import write_atomically
 
 REPORT_FILE: Final = "report.md"
 """Name of the report in the folder of results."""

@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from starid.identification.thesis.rsi import RecursiveIdentification, RsiSettings, region_cells, region_side
 from starid.lab.experiments.author_noise import identification_noise
 from starid.lab.experiments.experiment import Context, Evaluation, Parameters, Part, Results
 from starid.lab.experiments.figures import Curve, Panel, precision, precision_axes
@@ -29,7 +30,6 @@ from starid.lab.experiments.rsi_trials import (
 )
 from starid.lab.experiments.tables import RECURSION
 from starid.lab.simulation import NoiseModel, sky_sequence
-from starid.thesis.rsi import RecursiveIdentification, RsiSettings, region_cells, region_side
 
 SETTLING: Final = 5
 """Number of first frames left out of the statistics, in which false stars cannot be recognised yet."""

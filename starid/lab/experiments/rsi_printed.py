@@ -10,6 +10,13 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.identification.thesis.cme import matched_motion
+from starid.identification.thesis.false_stars import FalseStarFilter, FilterResult
+from starid.identification.thesis.features import extract_features
+from starid.identification.thesis.fsf import ClusterFilter
+from starid.identification.thesis.matlab_filter import MatlabFilter
+from starid.identification.thesis.metrics import rotation_error
+from starid.identification.thesis.rsi import RecursiveIdentification, RsiSettings
 from starid.lab.experiments.author_noise import identification_noise
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
 from starid.lab.experiments.lsi_trials import OFF, error_of, frames_under_test, stars_of
@@ -23,13 +30,6 @@ from starid.lab.experiments.rsi_trials import (
 )
 from starid.lab.experiments.tables import RECURSION
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, SimulatedFrame, sky_sequence, turned
-from starid.thesis.cme import matched_motion
-from starid.thesis.false_stars import FalseStarFilter, FilterResult
-from starid.thesis.features import extract_features
-from starid.thesis.fsf import ClusterFilter
-from starid.thesis.matlab_filter import MatlabFilter
-from starid.thesis.metrics import rotation_error
-from starid.thesis.rsi import RecursiveIdentification, RsiSettings
 
 _MARGIN_DEG: Final = 1.6
 _SIDE_DEG: Final = 4.0

@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.identification.thesis.metrics import boresight_error, rotation_error
+from starid.identification.thesis.rsi import RsiStep
 from starid.lab.simulation import SimulatedFrame
-from starid.thesis.metrics import boresight_error, rotation_error
-from starid.thesis.rsi import RsiStep
 
 START: Final = (108.41, 12.14)
 """Boresight of the first frame: corner (87.41°, −8.86°), 42° wide."""

@@ -13,10 +13,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.files import write_atomically
 from starid.lab.experiments.comparison import Outcome, ReproduceError
 from starid.lab.experiments.experiment import Context, Evaluation, Experiment, Part, Results
-from starid.result_store import read_results, write_results
+from starid.storage.files import write_atomically
+from starid.storage.results import read_results, write_results
 
 OUTCOME_FILE: Final = "outcome.json"
 """File of the outcome in the folder of an experiment."""

@@ -9,17 +9,17 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.identification.thesis.database import DatabaseParameters, build_database
+from starid.identification.thesis.features import FeatureVector
+from starid.identification.thesis.frame_sky import FrameSky, SkyError
+from starid.identification.thesis.fsf import ClusterFilter
+from starid.identification.thesis.lasso import LAMBDAS, lasso_path
+from starid.identification.thesis.lsi import LostInSpace
+from starid.identification.thesis.matlab_lasso import matlab_path
+from starid.identification.thesis.metrics import Confusion
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.experiments.fsf import frames_of_seven, noise_of
 from starid.lab.experiments.lsi_trials import OFF, error_of, frames_under_test, share
-from starid.thesis.database import DatabaseParameters, build_database
-from starid.thesis.features import FeatureVector
-from starid.thesis.frame_sky import FrameSky, SkyError
-from starid.thesis.fsf import ClusterFilter
-from starid.thesis.lasso import LAMBDAS, lasso_path
-from starid.thesis.lsi import LostInSpace
-from starid.thesis.matlab_lasso import matlab_path
-from starid.thesis.metrics import Confusion
 
 _OVERLAP: Final = 0.995
 _TAU: Final = 0.5

@@ -7,15 +7,20 @@ from typing import Any, Final
 
 import numpy as np
 
+from starid.identification.thesis.database import (
+    THESIS_KAPPA,
+    DatabaseParameters,
+    FeatureDatabase,
+    build_database,
+)
+from starid.identification.thesis.lasso import LAMBDAS
+from starid.identification.thesis.lsi import LostInSpace
+from starid.identification.thesis.matlab_lasso import matlab_path
+from starid.identification.thesis.metrics import boresight_error
+from starid.identification.thesis.subcell import SubcellSearch
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.experiments.figures import Curve, Panel
 from starid.lab.experiments.lsi_trials import HALF_FRAME_DEG
-from starid.thesis.database import THESIS_KAPPA, DatabaseParameters, FeatureDatabase, build_database
-from starid.thesis.lasso import LAMBDAS
-from starid.thesis.lsi import LostInSpace
-from starid.thesis.matlab_lasso import matlab_path
-from starid.thesis.metrics import boresight_error
-from starid.thesis.subcell import SubcellSearch
 
 _CORNER: Final = (95.0, -85.0)
 _COLUMNS: Final = ("n", "A", "r", "sigma_A", "sigma_r")

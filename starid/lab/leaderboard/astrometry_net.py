@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.attitude import Attitude
+from starid.attitude.wahba import solve_wahba
 from starid.camera import Camera
-from starid.wahba import solve_wahba
 
 PROGRAM: Final = "solve-field"
 TIME_LIMIT_S: Final = 5.0

@@ -16,7 +16,7 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.geometric.pattern_index import resolved_stars
+from starid.identification.geometric.pattern_index import resolved_stars
 from starid.lab.leaderboard.peers import (
     InvalidSolverError,
     NotInstalledError,

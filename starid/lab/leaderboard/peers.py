@@ -27,11 +27,11 @@ from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.geometric.pattern_index import field_solid_angle
+from starid.identification.geometric.pattern_index import field_solid_angle
+from starid.identification.solution import Solution
 from starid.lab.classic.registry import CLASSICS, make_identifier
 from starid.lab.leaderboard import astrometry_net
 from starid.lab.leaderboard.scenes import Scene
-from starid.solution import Solution
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.files import write_atomically
+from starid.storage.files import write_atomically
 
 Answer = Mapping[str, Any]
 
@@ -119,7 +119,7 @@ def _table(answer: Answer, value: str) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 def _plot_rates(answer: Answer, path: Path) -> None:
     """Draw the share of right answers as colour; in the cells, also the wrong ones, and the scenes if not all."""
-    from starid.plots import figure, save
+    from starid.storage.plots import figure, save
 
     solvers, rows = _names(answer, "solver"), _names(answer, "row")
     fig, axis = figure(width=2.5 + 0.62 * len(rows), height=1.8 + 0.3 * len(solvers))
@@ -139,7 +139,7 @@ def _plot_rates(answer: Answer, path: Path) -> None:
 
 def _plot_times(answer: Answer, path: Path) -> None:
     """Draw median and 99th percentile of the processor time of a solve, each as the median over the rows."""
-    from starid.plots import figure, save
+    from starid.storage.plots import figure, save
 
     solvers = _names(answer, "solver")
     fig, axis = figure(width=7.0, height=1.2 + 0.28 * len(solvers))

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
-from starid import cache
+from starid.storage import cache
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import CAMERA
 from tests.emulator.workers import WORKER

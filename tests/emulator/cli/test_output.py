@@ -193,7 +193,7 @@ def test_a_slow_start_reports_its_progress_on_stderr(
             slow_worker.touch()
             return 7
 
-    monkeypatch.setattr("starid.cache.kernels_written_since", count)
+    monkeypatch.setattr("starid.storage.cache.kernels_written_since", count)
     status, out, said = run_command_line(*command)
     assert (status, out) == (2, "")
     first, second, *_, last = said.splitlines()

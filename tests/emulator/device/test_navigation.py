@@ -12,7 +12,7 @@ from starhil.emulator.truth.orbit import KeplerOrbit, OrbitState
 from starhil.emulator.truth.table import OrbitTable, Span
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import FieldError
-from starid.earth import earth_velocity
+from starid.catalog.earth import earth_velocity
 
 NEW_YEAR = 1_767_225_600.0
 EQUINOX = 1_774_008_000.0

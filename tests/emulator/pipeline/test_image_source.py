@@ -27,7 +27,7 @@ from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starhil.protocol.icd import load_unit
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.camera_file import save_camera
+from starid.camera.file import save_camera
 from starid.catalog import load_catalog
 from starid.imaging.image_io import write_image
 

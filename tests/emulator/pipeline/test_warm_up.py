@@ -14,7 +14,7 @@ import numpy as np
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.pipeline.pipeline import make_pipeline
 from starhil.emulator.profile import load_profile
-from starid.jit import KernelFunction
+from starid.kernels.jit import KernelFunction
 
 def kernels():
     modules = [module for name, module in sys.modules.items() if name.partition(".")[0] in ("starid", "starhil")]

@@ -16,11 +16,11 @@ from starhil.emulator.sky.light import through_baffle
 from starhil.emulator.sky.objects import SkyObjects, icrs_vector
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.orbit import KeplerOrbit
-from starid.aberration import aberrated
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
-from starid.earth import earth_and_sun, earth_velocity, in_metres, terrestrial_time, unix_time
+from starid.catalog.aberration import aberrated
+from starid.catalog.earth import earth_and_sun, earth_velocity, in_metres, terrestrial_time, unix_time
 
 NEW_YEAR = unix_time("2026-01-01")
 BY_DATE = Sky({"bodies": "ephemeris"})

@@ -21,7 +21,7 @@ from starhil.emulator.truth.orbit import (
 )
 from starhil.emulator.truth.source import FixedTruth, TruthState
 from starid.attitude import Attitude
-from starid.earth import unix_time
+from starid.catalog.earth import unix_time
 
 NEW_YEAR = 1_767_225_600.0
 VANGUARD = (  # Vallado et al. 2006, AIAA 2006-6753, satellite 5

@@ -17,7 +17,7 @@ from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.plausibility import doubt_of_date, doubt_of_orbit
 from starhil.emulator.truth.source import TruthStatus
 from starid.attitude import Attitude
-from starid.earth import unix_time
+from starid.catalog.earth import unix_time
 from tests.emulator.runs import Control
 
 RUN = unix_time("2026-01-01")

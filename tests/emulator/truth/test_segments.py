@@ -15,7 +15,7 @@ from starhil.emulator.truth.file import read_orbit_file, read_truth_file
 from starhil.emulator.truth.source import TruthStatus
 from starhil.emulator.truth.spice_file import write_kernels
 from starid.attitude import Attitude, propagate
-from starid.earth import unix_time
+from starid.catalog.earth import unix_time
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.truth.test_standard_files import needs, run_orekit
 

@@ -21,7 +21,7 @@ from starhil.emulator.truth.source import SlewSegment, SlewTruth
 from starhil.emulator.truth.standard_frames import euler_turns, unix_ns
 from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
-from starid.earth import unix_time
+from starid.catalog.earth import unix_time
 from tests.emulator.cli.command_line import run_command_line
 
 SLEW = SlewTruth(

@@ -11,7 +11,7 @@ import pytest
 from starhil.emulator.sensor.renderer import render
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.camera_file import load_camera
+from starid.camera.file import load_camera
 from starid.catalog import load_catalog
 from starid.cli.app import main
 from starid.imaging.image_io import write_image

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.special import erf
 
+from starid.catalog.photometry import fitted_share
 from starid.errors import StaridError
 from starid.imaging.detection import Detections, DetectionSettings, detect
-from starid.photometry import fitted_share
 
 SIGMA = 0.8
 SKY, NOISE, GAIN = 40.0, 3.0, 2.0

@@ -14,8 +14,8 @@ from starid.attitude import ARCSEC_PER_RAD
 from starid.camera import Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.geometric.identifier import Identifier
-from starid.geometric.pattern_stars import select_pattern_stars
+from starid.identification.geometric.identifier import Identifier
+from starid.identification.geometric.pattern_stars import select_pattern_stars
 from starid.photograph import field_sweep, solver
 from starid.photograph.field_sweep import FieldSweep, solve_any_field
 from starid.photograph.rough_search import CELLS, RoughSearch, distorted, even_selection

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starid.errors import StaridError
-from starid.jit import compiled_ieee
+from starid.kernels.jit import compiled_ieee
 from starid.lab.classic import ant_colony, correlation, grid, oriented_svd, svd
 from starid.lab.classic.agreement import largest_group
 from starid.lab.classic.log_polar import _strings

@@ -13,12 +13,12 @@ from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.errors import StaridError
-from starid.geometric.pattern_index import field_solid_angle, resolved_stars
-from starid.interface import StarIdentifier
+from starid.identification.geometric.pattern_index import field_solid_angle, resolved_stars
+from starid.identification.interface import StarIdentifier
+from starid.identification.solution import Reason
 from starid.lab.classic.registry import CLASSICS, make_identifier
 from starid.lab.classic.solver import EVEN_PER_FIELD, ClassicIdentifier
 from starid.lab.leaderboard.scenes import SceneMaker, SceneSettings
-from starid.solution import Reason
 
 DEGREE_ARCSEC = 3600.0
 LIMIT = 5.5

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from starid.cli.app import build_app
 from starid.errors import StaridError
+from starid.identification.thesis.frame_grid import make_grid
 from starid.lab.experiments import registry, report, runner, tables
 from starid.lab.experiments.comparison import (
     Outcome,
@@ -47,7 +48,6 @@ from starid.lab.experiments.tables import (
     known_miss,
     numbers_by_choice,
 )
-from starid.thesis.frame_grid import make_grid
 
 TIME_COLUMN = 6
 

@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 from starid.attitude import Attitude
 from starid.cli.app import build_app
 from starid.errors import StaridError
+from starid.identification.solution import Reason, Solution
 from starid.lab.leaderboard import peers
 from starid.lab.leaderboard.comparison import ROWS, Tally, run
 from starid.lab.leaderboard.peers import Reply
 from starid.lab.leaderboard.scenes import Scene
-from starid.solution import Reason, Solution
 
 PROMISED = [
     "row", "solver", "frames", "valid_pct", "wrong", "boresight_median_arcsec", "floor_ratio", "median_ms", "p99_ms",

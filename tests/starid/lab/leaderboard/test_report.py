@@ -16,14 +16,14 @@ from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.cli.app import build_app
 from starid.errors import StaridError
-from starid.geometric.pattern_index import field_solid_angle
+from starid.identification.geometric.pattern_index import field_solid_angle
+from starid.identification.solution import Reason, Solution
 from starid.lab.classic.registry import CLASSICS
 from starid.lab.leaderboard import comparison as bench
 from starid.lab.leaderboard import peers
 from starid.lab.leaderboard.peers import ALL, make_solver
 from starid.lab.leaderboard.report import markdown, ranked, right, write_leaderboard
 from starid.lab.leaderboard.scenes import SceneMaker, SceneSettings
-from starid.solution import Reason, Solution
 
 PIXEL = 1.0
 

@@ -1,0 +1,1 @@
+"""Which stars these are, and the attitude that follows."""

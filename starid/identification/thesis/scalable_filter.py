@@ -1,0 +1,347 @@
+"""A false-star filter for hundreds of objects per frame: stars move together, and what does not is false.
+
+Objects are followed from frame to frame in coordinates that move with the stars. Transient objects (radiation
+hits, glints) are not seen again; stationary ones (hot pixels) stay behind when the stars move on; drifting
+ones (debris, other satellites) leave the gate. If the motion is so slow that stationary and drifting objects
+stay within the gate, they are recognised by their scatter about their position among the stars. The cost is a
+few operations per pair of objects, not the fourth power of their number.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from starid.arrays import Array, Indices, Mask
+from starid.identification.thesis.cme import rigid_fit
+from starid.identification.thesis.false_stars import FilterError, FilterResult, ObservedFrame
+from starid.identification.thesis.frame_motion import MAX_VOTERS, find_motion, nearest_objects
+
+MAX_OBJECTS: Final = 2000
+"""Largest number of objects in a frame."""
+
+_REFITS: Final = 3
+_MIN_OBJECTS: Final = 2
+_MIN_SCORE: Final = 2.0
+_SCATTER_FRAMES: Final = 3
+_MIN_SPREAD: Final = 0.5
+_SUMS: Final = 11
+_FADING: Final = 0.95
+_MOTION_NOISE: Final = 0.05
+_TRIM: Final = 2.2
+_STILL: Final = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True)
+class TrackFilterSettings:
+    """Properties of the sensor and its motion, and thresholds of the filter.
+
+    Attributes
+    ----------
+    position_sigma_deg
+        One-sigma error of a position per axis, degrees.
+    brightness_sigma
+        One-sigma error of a magnitude.
+    max_rotation_deg, max_shift_deg
+        Largest rotation and shift from one frame to the next, degrees.
+    gate
+        Largest distance of an object from the expected position of a star, in sigmas.
+    evidence
+        How much better, in squared sigmas, "fixed on the sensor" must explain an object than "star" to be
+        accepted; twice as much for "drifting".
+    history
+        Number of frames for which a star may be missing before it is forgotten.
+    confirm
+        Number of sightings that make an object a true star, once that many frames have been seen. Two are
+        enough if all false stars are transient and positions are accurate; slow false stars need three.
+    """
+
+    position_sigma_deg: float = 0.02
+    brightness_sigma: float = 0.2
+    max_rotation_deg: float = 10.0
+    max_shift_deg: float = 8.0
+    gate: float = 3.8
+    evidence: float = 9.0
+    history: int = 4
+    confirm: int = 3
+
+    def __post_init__(self) -> None:
+        if not (self.position_sigma_deg > 0.0 and self.brightness_sigma > 0.0 and self.gate > 0.0):
+            raise FilterError("filter: the errors of position and brightness and the gate must be positive")
+        if self.history < 1 or self.confirm < _MIN_OBJECTS:
+            raise FilterError("filter: history must be at least 1 and confirm at least 2")
+
+
+@dataclass(frozen=True, eq=False)
+class TrackResult:
+    """The result of the filter for one frame.
+
+    Attributes
+    ----------
+    true_now
+        Which objects are true stars, (n,). In the first frame nothing is known, so all are False.
+    track
+        Track number of each object, (n,), the same for a star in every frame.
+    motion
+        Motion of the stars since the previous frame: cosine, sine, shift x, shift y (degrees); or None.
+    """
+
+    true_now: Mask
+    track: Indices
+    motion: Array | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Tracks:
+    """Tracked objects: current position and magnitude, and sums over their observations for the scatter.
+
+    `sums` (n, 11) has, with fading weights, Σ1, Σt, Σt², then Σx, Σy, Σ(x² + y²), Σt·x, Σt·y in coordinates
+    that move with the stars, and Σu, Σv, Σ(u² + v²) in sensor coordinates.
+    """
+
+    number: Indices
+    position: Array
+    variance: Array
+    brightness: Array
+    seen: Indices
+    missed: Indices
+    sums: Array
+
+    def __len__(self) -> int:
+        return int(self.number.size)
+
+    def kept(self, mask: Mask) -> _Tracks:
+        return _Tracks(*(getattr(self, name)[mask] for name in _COLUMNS))
+
+    def joined(self, other: _Tracks) -> _Tracks:
+        return _Tracks(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in _COLUMNS))
+
+
+_COLUMNS: Final = tuple(field.name for field in dataclasses.fields(_Tracks))
+
+
+class TrackFilter:
+    """The scalable filter: pass frames in sequence to `update`, or call it to compare two frames.
+
+    Parameters
+    ----------
+    settings
+        Properties of the sensor and its motion, and thresholds.
+    """
+
+    def __init__(self, settings: TrackFilterSettings | None = None) -> None:
+        self.settings = settings or TrackFilterSettings()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all tracks, for example after a gap in the frames."""
+        self._last_frame: ObservedFrame | None = None
+        self._last_result: TrackResult | None = None
+        self._next_number = 0
+        self._frame = 0
+        self._anchor = _STILL.copy()
+        self._last_motion = _STILL.copy()
+        self._tracks = self._new_tracks(np.empty((0, 2)), np.empty(0))
+        self._suspect = np.empty(0, dtype=np.bool_)
+
+    def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
+        """Compare two frames; earlier frames are taken into account if the first is the one seen last."""
+        if before is not self._last_frame or self._last_result is None:
+            self.reset()
+            self._last_result = self.update(before)
+        first = self._last_result.track
+        second = self.update(now)
+        self._last_frame, self._last_result = now, second
+        place = {int(number): i for i, number in enumerate(first)}
+        pairs = [(place.get(int(second.track[j])), int(j)) for j in np.flatnonzero(second.true_now)]
+        found = [pair for pair in pairs if pair[0] is not None]
+        matches = np.array(found, dtype=np.int64).reshape(-1, 2)
+        true_before = np.zeros(len(before), dtype=np.bool_)
+        true_before[matches[:, 0]] = True
+        return FilterResult(true_before, second.true_now, matches)
+
+    def update(self, frame: ObservedFrame) -> TrackResult:
+        """Follow the objects of the next frame.
+
+        Raises
+        ------
+        FilterError
+            The frame has more than `MAX_OBJECTS` objects.
+        """
+        if len(frame) > MAX_OBJECTS:
+            raise FilterError(
+                f"filter: {len(frame)} objects in a frame, at most {MAX_OBJECTS}; raise the detection threshold"
+            )
+        self._frame += 1
+        positions = np.ascontiguousarray(frame.positions, dtype=np.float64)
+        brightness = np.ascontiguousarray(frame.brightness, dtype=np.float64)
+        motion = self._find_motion(positions, brightness)
+        if motion is None:
+            fresh = self._new_tracks(positions, brightness)
+            self._tracks = self._tracks.joined(fresh) if len(frame) < _MIN_OBJECTS else fresh
+            self._suspect = np.zeros(len(self._tracks), dtype=np.bool_)
+            return TrackResult(np.zeros(len(frame), dtype=np.bool_), fresh.number, None)
+        partner = self._associate(positions, brightness, motion)
+        self._last_motion = motion
+        self._anchor = _composed(motion, self._anchor)
+        self._update_tracks(positions, brightness, partner, motion)
+        wandering = self._fixed_or_drifting()
+        genuine = (self._tracks.seen >= min(self.settings.confirm, self._frame)) & ~wandering
+        true_now = np.zeros(len(frame), dtype=np.bool_)
+        number = np.full(len(frame), -1, dtype=np.int64)
+        matched = np.flatnonzero(partner >= 0)
+        true_now[partner[matched]] = genuine[matched]
+        number[partner[matched]] = self._tracks.number[matched]
+        new = number < 0
+        fresh = self._new_tracks(positions[new], brightness[new])
+        number[new] = fresh.number
+        tracks = self._tracks
+        keep = (tracks.missed == 0) | ((tracks.missed < self.settings.history) & (tracks.seen > 1))
+        self._tracks = tracks.kept(keep).joined(fresh)
+        self._suspect = np.concatenate([wandering[keep], np.zeros(len(fresh), dtype=np.bool_)])
+        return TrackResult(true_now, number, motion)
+
+    def _new_tracks(self, positions: Array, brightness: Array) -> _Tracks:
+        n = brightness.size
+        number = np.arange(self._next_number, self._next_number + n, dtype=np.int64)
+        self._next_number += n
+        tracks = _Tracks(
+            number,
+            positions.copy(),
+            np.full(n, self.settings.position_sigma_deg**2),
+            brightness.copy(),
+            np.ones(n, dtype=np.int64),
+            np.zeros(n, dtype=np.int64),
+            np.zeros((n, _SUMS)),
+        )
+        self._add_to_sums(tracks.sums, np.arange(n), positions)
+        return tracks
+
+    def _add_to_sums(self, sums: Array, which: Indices, positions: Array) -> None:
+        x, y = _moved_back(positions, self._anchor).T
+        u, v = positions.T
+        t = np.full(x.size, float(self._frame))
+        terms = [np.ones_like(t), t, t * t, x, y, x * x + y * y, t * x, t * y, u, v, u * u + v * v]
+        sums[which] += np.column_stack(terms)
+
+    def _find_motion(self, positions: Array, brightness: Array) -> Array | None:
+        """Find the motion since the previous frame from established bright objects; None if none fits."""
+        tracks, settings = self._tracks, self.settings
+        if len(tracks) < _MIN_OBJECTS or brightness.size < _MIN_OBJECTS:
+            return None
+        voters = np.lexsort((tracks.brightness, -np.minimum(tracks.seen, 2)))[:MAX_VOTERS]
+        brightest = np.argsort(brightness, kind="stable")[:MAX_VOTERS]
+        motion = self._last_motion.copy()
+        score = find_motion(
+            tracks.position[voters],
+            tracks.brightness[voters],
+            positions[brightest],
+            brightness[brightest],
+            settings.position_sigma_deg,
+            settings.brightness_sigma,
+            math.radians(settings.max_rotation_deg),
+            settings.max_shift_deg,
+            motion,
+        )
+        return motion if score >= _MIN_SCORE else None
+
+    def _associate(self, positions: Array, brightness: Array, motion: Array) -> Indices:
+        """Match tracks and objects, refining the motion in place; return the object of each track, or −1."""
+        tracks, settings = self._tracks, self.settings
+        partner = np.empty(len(tracks), dtype=np.int64)
+        trusted = (tracks.seen > 1) & ~self._suspect
+        error = np.zeros(len(tracks))
+        for turn in range(_REFITS):
+            predicted = _moved(tracks.position, motion)
+            variance = tracks.variance + settings.position_sigma_deg**2
+            nearest_objects(
+                positions,
+                brightness,
+                predicted,
+                tracks.brightness,
+                variance + error,
+                settings.brightness_sigma,
+                settings.gate**2,
+                partner,
+            )
+            chosen = partner >= 0
+            if np.count_nonzero(chosen & trusted) > _MIN_OBJECTS:
+                chosen &= trusted
+            objects = positions[np.maximum(partner, 0)]
+            if turn > 0:
+                distance = np.hypot(*(objects - predicted).T) / np.sqrt(variance)
+                near = chosen & (distance <= _TRIM * max(float(np.median(distance[chosen])), 1.0))
+                chosen = near if np.count_nonzero(near) > _MIN_OBJECTS else chosen
+            if rigid_fit(tracks.position, objects, chosen, motion):
+                arm = np.sum((tracks.position - tracks.position[chosen].mean(axis=0)) ** 2, axis=1)
+                share = 1.0 / np.count_nonzero(chosen) + arm / max(float(arm[chosen].sum()), 1e-12)
+                error = settings.position_sigma_deg**2 * np.minimum(share, 1.0)
+        return partner
+
+    def _update_tracks(self, positions: Array, brightness: Array, partner: Indices, motion: Array) -> None:
+        """Move all tracks with the stars and update the matched ones."""
+        old, sigma2 = self._tracks, self.settings.position_sigma_deg**2
+        which = np.flatnonzero(partner >= 0)
+        objects = partner[which]
+        position = _moved(old.position, motion)
+        variance = old.variance + _MOTION_NOISE * sigma2
+        gain = variance[which] / (variance[which] + sigma2)
+        position[which] += gain[:, None] * (positions[objects] - position[which])
+        variance[which] *= 1.0 - gain
+        magnitude = old.brightness.copy()
+        magnitude[which] += (brightness[objects] - magnitude[which]) / (old.seen[which] + 1.0)
+        seen, missed = old.seen.copy(), old.missed + 1
+        seen[which] += 1
+        missed[which] = 0
+        sums = _FADING * old.sums
+        self._add_to_sums(sums, which, positions[objects])
+        self._tracks = _Tracks(old.number, position, variance, magnitude, seen, missed, sums)
+
+    def _fixed_or_drifting(self) -> Mask:
+        """Whether each track is better explained as fixed on the sensor or drifting than as a star.
+
+        Each of the three explanations has a sum of squared residuals; their differences, in units of the
+        usual variance, are tested. Subtracting the median removes an error of the motion.
+        """
+        tracks = self._tracks
+        result = np.zeros(len(tracks), dtype=np.bool_)
+        old = np.flatnonzero(tracks.seen >= _SCATTER_FRAMES)
+        if old.size <= _MIN_OBJECTS:
+            return result
+        n, t, tt, x, y, xx, tx, ty, u, v, uu = tracks.sums[old].T
+        as_star = np.maximum(xx - (x * x + y * y) / n, 0.0)
+        as_fixed = np.maximum(uu - (u * u + v * v) / n, 0.0)
+        usual = max(self.settings.position_sigma_deg**2, float(np.median(as_star / (2.0 * n))))
+        spread = np.maximum(tt - t * t / n, _MIN_SPREAD)
+        velocity = np.column_stack([tx - t * x / n, ty - t * y / n]) / spread[:, None]
+        velocity -= np.median(velocity, axis=0)
+        drift = np.sum(velocity**2, axis=1) * spread / usual
+        drift /= max(1.0, float(np.median(drift)))
+        limit = self.settings.evidence
+        result[old] = ((as_star - as_fixed) / usual > limit) | (drift > 2.0 * limit)
+        return result
+
+
+def _moved(positions: Array, motion: Array) -> Array:
+    c, s, x, y = motion
+    return np.column_stack(
+        [c * positions[:, 0] - s * positions[:, 1] + x, s * positions[:, 0] + c * positions[:, 1] + y]
+    )
+
+
+def _moved_back(positions: Array, motion: Array) -> Array:
+    c, s, x, y = motion
+    u, v = positions[:, 0] - x, positions[:, 1] - y
+    return np.column_stack([c * u + s * v, c * v - s * u])
+
+
+def _composed(second: Array, first: Array) -> Array:
+    """Compose two motions: `first` followed by `second`."""
+    c, s = second[0] * first[0] - second[1] * first[1], second[1] * first[0] + second[0] * first[1]
+    x = second[0] * first[2] - second[1] * first[3] + second[2]
+    y = second[1] * first[2] + second[0] * first[3] + second[3]
+    return np.array([c, s, x, y])

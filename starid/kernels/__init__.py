@@ -1,0 +1,1 @@
+"""Compiled loops: how they are compiled, kept and loaded."""

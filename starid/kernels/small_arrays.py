@@ -1,0 +1,52 @@
+"""What kernels do with small arrays where the form that numpy has for it takes seconds to compile."""
+
+from __future__ import annotations
+
+import math
+
+from starid.arrays import Array, Array32
+from starid.kernels.jit import inner
+
+
+@inner
+def copy_values(source: Array | Array32, target: Array | Array32) -> None:
+    """Copy an array (n,); assigning to a slice or a row compiles the text of the error for other shapes too."""
+    for k in range(target.size):
+        target[k] = source[k]
+
+
+@inner
+def lower_median(values: Array, count: int) -> float:
+    """Lower median of the first `count` values, which are reordered in place (quickselect)."""
+    low, high, middle = 0, count - 1, (count - 1) // 2
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            break
+    return float(values[middle])
+
+
+@inner
+def median(values: Array, count: int) -> float:
+    """Median of the first `count` values, which are reordered in place; of an even number, the mean of both in the middle."""
+    lower = lower_median(values, count)
+    if count % 2 == 1:
+        return lower
+    upper = math.inf
+    for k in range(count // 2, count):
+        upper = min(upper, values[k])
+    return 0.5 * (lower + upper)

@@ -1,0 +1,172 @@
+"""Files named by the user: reading them, and what is kept when one is overwritten."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+import threading
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starid.attitude import Attitude, turn_text
+from starid.camera.file import load_camera
+from starid.catalog.hipparcos import read_hip2
+from starid.errors import StaridError
+from starid.identification.thesis.database import DatabaseError
+from starid.identification.thesis.database_file import load_database
+from starid.imaging.image_io import read_image, write_image
+from starid.storage.files import read_bytes, read_number, read_text, write_atomically
+
+READERS = [
+    (read_image, StaridError),
+    (load_camera, StaridError),
+    (read_hip2, StaridError),
+    (load_database, DatabaseError),
+]
+
+
+def test_a_pipe_receives_the_file_and_stays_a_pipe(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    seen: list[bytes] = []
+    holder = os.open(pipe, os.O_RDWR)  # so that neither end waits for the other
+    try:
+        write_atomically(pipe, lambda part: part.write_bytes(b"whole"))
+        seen.append(os.read(holder, 100))
+    finally:
+        os.close(holder)
+    assert seen == [b"whole"]
+    assert stat.S_ISFIFO(pipe.lstat().st_mode)
+
+
+@pytest.mark.parametrize("device", ["/dev/null", "/dev/full"])
+def test_a_device_is_written_in_place(tmp_path: Path, device: str) -> None:
+    link = tmp_path / "device"
+    link.symlink_to(device)
+    full = pytest.raises(OSError, match="No space left on device")
+    with full if device == "/dev/full" else nullcontext():
+        write_atomically(link, lambda part: part.write_bytes(b"whole"))
+    assert link.is_symlink()
+    assert stat.S_ISCHR(link.stat().st_mode)
+    assert list(tmp_path.iterdir()) == [link]
+
+
+def test_a_link_to_a_file_stays_a_link_and_the_file_is_replaced(tmp_path: Path) -> None:
+    target, link = tmp_path / "there" / "file", tmp_path / "link"
+    link.symlink_to(target)
+    write_atomically(link, lambda part: part.write_bytes(b"first"))
+    write_atomically(link, lambda part: part.write_bytes(b"second"))
+    assert link.is_symlink()
+    assert target.read_bytes() == b"second"
+    assert list(target.parent.iterdir()) == [target]
+
+
+def test_a_folder_is_not_overwritten(tmp_path: Path) -> None:
+    with pytest.raises(IsADirectoryError):
+        write_atomically(tmp_path, lambda part: part.write_bytes(b"whole"))
+
+
+@pytest.mark.parametrize("into_file", [False, True])
+def test_standard_output_is_written_in_place(tmp_path: Path, *, into_file: bool) -> None:
+    program = (
+        "import sys; from pathlib import Path; from starid.storage.files import write_atomically;"
+        "print('before'); write_atomically(Path(sys.argv[1]), lambda part: part.write_text('whole\\n')); print('after')"
+    )
+    link, file = tmp_path / "stdout", tmp_path / "file"
+    link.symlink_to("/dev/stdout")
+    command = [sys.executable, "-c", program, str(link)]
+    if into_file:
+        with file.open("wb") as stream:
+            subprocess.run(command, stdout=stream, check=True, timeout=120)
+        said = file.read_text()
+    else:
+        said = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=120).stdout
+    assert said == "before\nwhole\nafter\n"
+    assert link.is_symlink()
+
+
+def test_a_stream_without_a_suffix_gets_a_png(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    seen: list[bytes] = []
+    reader = threading.Thread(target=lambda: seen.append(pipe.read_bytes()), daemon=True)
+    reader.start()
+    write_image(pipe, np.arange(64, dtype=np.uint8).reshape(8, 8))
+    reader.join(timeout=60.0)
+    assert seen[0].startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(("reader", "error_type"), READERS)
+@pytest.mark.parametrize("kind", ["zero", "pipe", "folder"])
+def test_only_regular_files_are_read(
+    tmp_path: Path, reader: object, error_type: type[Exception], kind: str
+) -> None:
+    path = tmp_path / kind
+    if kind == "zero":
+        path.symlink_to("/dev/zero")
+    elif kind == "pipe":
+        os.mkfifo(path)
+    else:
+        path.mkdir()
+    program = (
+        "import resource, sys; from pathlib import Path; import importlib;"
+        "resource.setrlimit(resource.RLIMIT_AS, (6 << 30, 6 << 30));"
+        "module = importlib.import_module(sys.argv[1]);"
+        "error = getattr(importlib.import_module(sys.argv[3]), sys.argv[4])\n"
+        "try: getattr(module, sys.argv[2])(Path(sys.argv[5]))\n"
+        "except error as caught: print(caught)"
+    )
+    names = [reader.__module__, reader.__name__, error_type.__module__, error_type.__name__]  # type: ignore[attr-defined]
+    done = subprocess.run(
+        [sys.executable, "-c", program, *names, str(path)], capture_output=True, text=True, timeout=120
+    )
+    wanted = "Is a directory" if kind == "folder" else "not a regular file"
+    assert wanted in done.stdout, done.stderr[-300:]
+    assert done.stdout.count("\n") == 1
+    assert str(path) in done.stdout
+
+
+def test_a_file_beyond_the_limit_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "sparse.png"
+    with path.open("wb") as stream:
+        stream.truncate(1 << 40)
+    with pytest.raises(StaridError, match="larger than 1000 MB"):
+        read_image(path)
+    path.write_bytes(b"12345")
+    assert read_bytes(path, 5) == b"12345"
+    with pytest.raises(OSError, match="larger than"):
+        read_bytes(path, 4)
+
+
+def test_a_byte_order_mark_is_not_part_of_the_text(tmp_path: Path) -> None:
+    path = tmp_path / "camera.toml"
+    path.write_bytes(b"\xef\xbb\xbf[camera]\nwidth = 640\nheight = 480\nfov_deg = 20.0\n")
+    assert read_text(path).startswith("[camera]")
+    assert load_camera(path).width == 640
+
+
+@pytest.mark.parametrize("text", ["1_0", "nan", "inf", "-inf", "1e999", "", "x", "١", "0x10", "1,5"])
+def test_python_only_notation_is_not_a_number(text: str) -> None:
+    with pytest.raises(ValueError, match="not a number"):
+        read_number(text)
+
+
+@pytest.mark.parametrize(("text", "value"), [("1", 1.0), (" -1.5e3 ", -1500.0), (".5", 0.5), ("2.", 2.0)])
+def test_numbers_as_other_programs_write_them_are_read(text: str, value: float) -> None:
+    assert read_number(text) == value
+
+
+@pytest.mark.parametrize(
+    ("degrees", "said"), [(359.99996, "0.000"), (-1e-17, "0.000"), (359.9994, "359.999"), (360.0, "0.000")]
+)
+def test_a_formatted_angle_is_below_360_degrees_after_rounding(degrees: float, said: str) -> None:
+    assert turn_text(degrees, 3) == said
+
+
+def test_angles_just_below_a_full_turn_are_shown_as_0() -> None:
+    assert str(Attitude.from_radec_roll(-1e-6, 10.0, -1e-6)) == "RA 0.0000° Dec +10.0000° roll 0.0000°"
