@@ -71,7 +71,7 @@ reproduce: $(VENV)/.lab
 	$(BIN)/starid reproduce --output out/reproduce $(REPRODUCE)
 
 fuzz: $(VENV)/.developer
-	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/test_composed_faults.py tests/protocol/test_unit_fuzz.py tests/protocol/canopen/test_slave_fuzz.py
+	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/serial/test_composed_faults.py tests/protocol/unit/test_unit_fuzz.py tests/protocol/canopen/test_slave_fuzz.py
 
 $(VENV)/.measuring: $(VENV)/.developer
 	$(BIN)/pip install --quiet --no-compile --editable '.[measuring]'
@@ -106,7 +106,7 @@ cosmos: $(VENV)/.developer
 	$(BIN)/python -c '$(SITE)' >"$$(out/cosmos/bin/python -c '$(SITE)')/product.pth"  # what the product has is not installed again
 	$(BIN)/python -m pip --python out/cosmos/bin/python install --quiet openc3
 	PYTHONPATH=$$(out/cosmos/bin/python -c '$(SITE)') \
-		$(BIN)/python -m pytest -k cosmos tests/protocol/test_export.py tests/process/test_cosmos_plugin.py
+		$(BIN)/python -m pytest -k cosmos tests/protocol/export/test_export.py tests/process/test_cosmos_plugin.py
 
 clean:
 	rm -rf $(VENV) out build dist

@@ -15,7 +15,7 @@ from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.pipeline.messages import DIRECTION_BITS, CatalogUpset
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
-from starhil.protocol.names import did_you_mean, remedy
+from starhil.protocol.errors import did_you_mean, remedy
 
 
 def check_sky(values: dict[str, Any]) -> dict[str, Any]:

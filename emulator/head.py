@@ -41,11 +41,11 @@ from starhil.emulator.revival import PipelineRevival
 from starhil.emulator.symlink_lock import lock_symlink
 from starhil.emulator.tape import Recorder, Wiring
 from starhil.emulator.truth.truth import SensorTruth, Truth
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import IcdError, ProtocolError
-from starhil.protocol.serial_stack import chosen_dialect
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.serial.stack import chosen_dialect
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 

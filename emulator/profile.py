@@ -41,15 +41,15 @@ from starhil.emulator.truth.config import (
     TruthConfig,
     UserPath,
 )
-from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import DEFAULT_UNIT, bundled_units, find, not_found, remedy
-from starhil.protocol.user_file import TomlError, parse_toml
-from starhil.protocol.validation_messages import problems
+from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError, remedy
+from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled_units, find, not_found
+from starhil.protocol.files.user_file import TomlError, parse_toml
+from starhil.protocol.files.validation import problems
+from starhil.protocol.unit import load_unit
 from starid.catalog.earth import unix_time
 
 if TYPE_CHECKING:
-    from starhil.protocol.values import Parameter
+    from starhil.protocol.icd.values import Parameter
     from starid.camera import Camera
 
 DEFAULT_PROFILE: Final = "cubestar"

@@ -41,11 +41,11 @@ from starhil.emulator.tape import (
 )
 from starhil.emulator.truth.config import FileConfig, Strict, TruthConfig
 from starhil.emulator.truth_log import TruthLog
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.files.validation import problems
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
-from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
 from starid.storage.files import open_regular, read_text
 

@@ -12,7 +12,7 @@ from typing import Any
 from starhil.emulator.errors import explained
 from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
 from starhil.emulator.truth_log import WALL_TIMES
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import Reply, ReplyKind
 from starid.storage.files import open_regular
 

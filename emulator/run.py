@@ -32,9 +32,9 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.pump import StepPump
 from starhil.emulator.tape import Recorder, Wiring
 from starhil.emulator.truth.truth import Truth, TruthHost
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_examples import served
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.unit import load_unit
+from starhil.protocol.unit.examples import served
 
 
 class Run:

@@ -22,7 +22,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.output_file import Output, OutputFile
 from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
 from starhil.emulator.pipeline.messages import PipelineEnded
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from starhil.emulator.errors import EmulatorError, explained
-from starhil.protocol.names import Kind, find, not_found
-from starhil.protocol.user_file import TomlError, read_user_toml
+from starhil.protocol.files.bundled import Kind, find, not_found
+from starhil.protocol.files.user_file import TomlError, read_user_toml
 
 
 def find_toml(kind: Kind, name_or_path: str, relative_to: Path = Path()) -> Path:

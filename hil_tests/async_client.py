@@ -12,11 +12,12 @@ from typing import Any, Final
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError, NoReplyError
 from starhil.hil_tests.links import HostLink
 from starhil.hil_tests.transactions import Ack, Reading, Transaction
-from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition, Names
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.definition import Names
+from starhil.protocol.icd.values import Value
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.values import Value
 
 DEFAULT_TIMEOUT_S: Final = 1.0
 """Time-out in current public flight software."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.conventions import Conventions
+from starhil.protocol.icd.conventions import Conventions
 
 ARCSEC_PER_RAD: Final = math.degrees(1.0) * 3600.0
 _NORM_TOLERANCE: Final = 0.02

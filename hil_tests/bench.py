@@ -17,8 +17,8 @@ from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
 from starhil.hil_tests.wire_log import WireLog
-from starhil.protocol.candump import bus_name
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.can.frame import bus_name
+from starhil.protocol.icd import InterfaceDefinition
 
 
 @dataclass(frozen=True)

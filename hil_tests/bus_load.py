@@ -20,12 +20,13 @@ from starhil.hil_tests.latency import REQUESTED_ROWS, ask_in_turn, exchange
 from starhil.hil_tests.links import DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS, CanHostLink
 from starhil.hil_tests.load_figures import CanLoad, Spread
 from starhil.hil_tests.realtime import set_realtime_priority
-from starhil.protocol.can_framing import CanFrame, CanId, MessageType
-from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.can.cubespace import CanId, MessageType
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Row
 from starhil.protocol.messages import Reply, Request
-from starhil.protocol.transports import open_can
+from starhil.protocol.transports.can import open_can
 
 HOST: Final = DEFAULT_HOST_ADDRESS
 DEVICE: Final = DEFAULT_DEVICE_ADDRESS

@@ -5,15 +5,15 @@ from __future__ import annotations
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import HostLink
 from starhil.hil_tests.wire_log import WireLog
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError, error_of
 from starhil.protocol.canopen.cob import SDO_RECEIVE, SDO_TRANSMIT
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import SdoTransfer, row_transfer
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import IcdError
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.transports import open_can
+from starhil.protocol.transports.can import open_can
 
 
 class CanopenHostLink(HostLink[CanFrame]):

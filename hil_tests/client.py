@@ -19,10 +19,10 @@ from starhil.hil_tests.links import (
 )
 from starhil.hil_tests.loop_thread import LoopThread
 from starhil.hil_tests.wire_log import WireLog
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.icd import load_unit
+from starhil.protocol.files.bundled import DEFAULT_UNIT
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import Reply
-from starhil.protocol.names import DEFAULT_UNIT
+from starhil.protocol.unit import load_unit
 
 __tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 

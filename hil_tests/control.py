@@ -17,8 +17,8 @@ from starhil.hil_tests.attitude import (
     unit,
 )
 from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE, BenchError
-from starhil.protocol.conventions import Conventions
 from starhil.protocol.errors import reason
+from starhil.protocol.icd.conventions import Conventions
 
 __tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 

@@ -20,7 +20,7 @@ from urllib.parse import unquote
 from starhil.hil_tests.attitude import Quaternion
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.protocol.errors import OneLineError
-from starhil.protocol.names import DEFAULT_UNIT
+from starhil.protocol.files.bundled import DEFAULT_UNIT
 
 READY_WITHIN_S: Final = 300.0
 """The first start on a machine compiles for minutes; later ones take about 3 s."""

@@ -29,9 +29,9 @@ from starhil.hil_tests.attitude import (
     unit,
 )
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.conventions import Conventions
-from starhil.protocol.names import did_you_mean
-from starhil.protocol.values import Value
+from starhil.protocol.errors import did_you_mean
+from starhil.protocol.icd.conventions import Conventions
+from starhil.protocol.icd.values import Value
 
 RELATIVE_ROUNDING: Final = 1e-6
 """Numbers without a tolerance may differ by the rounding of a 32-bit float."""

@@ -13,6 +13,7 @@ from typing import Any, Final
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError
 from starhil.hil_tests.transactions import Reading
+from starhil.protocol.icd.values import Value
 from starhil.protocol.image_transfer import (
     FRAME_SIZE,
     MAP_PARTS,
@@ -24,7 +25,6 @@ from starhil.protocol.image_transfer import (
     parse_burst_packet,
 )
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.values import Value
 from starid.storage.files import write_atomically
 
 FRAME_ATTEMPTS: Final = 3

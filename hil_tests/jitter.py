@@ -13,12 +13,12 @@ from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError, NackError, NoReplyError
 from starhil.hil_tests.links import CanHostLink
 from starhil.hil_tests.load_figures import Jitter, Spread
-from starhil.protocol.can_framing import MAX_STANDARD_ID, CanFrame
+from starhil.protocol.can.frame import MAX_STANDARD_ID, CanFrame
 from starhil.protocol.canopen import cob
 from starhil.protocol.canopen.abort import SdoAbortError
 from starhil.protocol.canopen.sdo_client import SdoTransfer, download, upload
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.transports import open_can
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.transports.can import open_can
 
 WARM_UP: Final = 3
 """Number of messages that are ignored at the start."""

@@ -24,12 +24,12 @@ from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, LinkLostError, NackError, NoReplyError
 from starhil.hil_tests.links import CanHostLink, HostLink, SerialHostLink
 from starhil.hil_tests.load_figures import Spread
-from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.icd import load_unit
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Row
 from starhil.protocol.messages import Reply, Request
-from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.transports import open_serial
+from starhil.protocol.serial.stack import SerialStack
+from starhil.protocol.transports.serial import open_serial
+from starhil.protocol.unit import load_unit
 
 REQUESTED_ROWS: Final = (
     "identification",

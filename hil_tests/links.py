@@ -10,13 +10,16 @@ from typing import Final, Generic, TypeVar
 
 from starhil.hil_tests.errors import LinkLostError
 from starhil.hil_tests.wire_log import WireLog
-from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_request_frames
-from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.can.cubespace import CanHostReceiver, encode_request_frames
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Row
 from starhil.protocol.messages import LinkFault, Receiver, Reply, Request
-from starhil.protocol.serial_stack import HostReceiver, SerialStack, chosen_dialect
-from starhil.protocol.transports import Transport, open_can, open_serial
+from starhil.protocol.serial.stack import HostReceiver, SerialStack, chosen_dialect
+from starhil.protocol.transports.base import Transport
+from starhil.protocol.transports.can import open_can
+from starhil.protocol.transports.serial import open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1
 """CAN address of the OBC in public flight software."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from starhil.hil_tests.client import ObcClient
     from starhil.hil_tests.control import ControlClient, Truth
     from starhil.hil_tests.emulator_process import EmulatorProcess
-    from starhil.protocol.names import Kind
+    from starhil.protocol.files.bundled import Kind
 
 
 NAMED: Final[dict[Kind, str]] = {"unit": "--starhil-unit", "profile": "--starhil-profile"}
@@ -66,7 +66,7 @@ def pytest_configure(config: pytest.Config) -> None:
     )
     for kind, option in NAMED.items():
         if (name := config.getoption(option)) is not None:
-            from starhil.protocol.names import find, not_found
+            from starhil.protocol.files.bundled import find, not_found
 
             if not find(kind, name).exists():
                 raise pytest.UsageError(f"{option}: {not_found(kind, name)}")
@@ -215,7 +215,7 @@ def starhil_control(starhil_emulator: EmulatorProcess) -> Iterator[ControlClient
 def starhil_truth(starhil_control: ControlClient, starhil_emulator: EmulatorProcess) -> Truth:
     """Return the truth of the emulator: `point`, `set`, `attitude` and `error`."""
     from starhil.hil_tests.control import Truth
-    from starhil.protocol.icd import load_unit
-    from starhil.protocol.names import DEFAULT_UNIT
+    from starhil.protocol.files.bundled import DEFAULT_UNIT
+    from starhil.protocol.unit import load_unit
 
     return Truth(starhil_control, load_unit(starhil_emulator.unit or DEFAULT_UNIT).conventions)

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 
 from starhil.hil_tests.loop_thread import LoopThread
-from starhil.protocol.hub import DEFAULT_BUS, CanHub
 from starhil.protocol.transports.can import kernel_can_is_up
+from starhil.protocol.transports.hub import DEFAULT_BUS, CanHub
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from typing import Any, Final
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import HostLink
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 
 _FRAME: Final = re.compile(r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(R|(?:[0-9A-Fa-f]{2}|\.\.){0,8})")

@@ -13,7 +13,7 @@ from xml.etree import ElementTree as ET
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.expect import show
 from starhil.hil_tests.interruption import Interrupted
-from starhil.protocol.values import Value
+from starhil.protocol.icd.values import Value
 from starid.storage.files import is_stream, write_atomically
 
 PASSED: Final = "passed"

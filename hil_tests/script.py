@@ -14,11 +14,10 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.expect import Keys, StatedAttitude
 from starhil.hil_tests.steps import ACTIONS, FileName, Link, Step, Texts, Timeout
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.errors import MAX_PROBLEMS
-from starhil.protocol.names import did_you_mean
-from starhil.protocol.user_file import TomlError, read_user_toml
-from starhil.protocol.validation_messages import problems
+from starhil.protocol.errors import MAX_PROBLEMS, did_you_mean
+from starhil.protocol.files.user_file import TomlError, read_user_toml
+from starhil.protocol.files.validation import problems
+from starhil.protocol.icd import InterfaceDefinition
 
 Table = TypeVar("Table", bound=Keys)
 

@@ -12,12 +12,13 @@ from collections import deque
 from typing import Final
 
 from starhil.hil_tests.load_figures import SerialLoad
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.image_transfer import MAP_PART_SIZE
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.transports import SerialTransport, open_serial
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.serial.stack import SerialStack
+from starhil.protocol.transports.paced import SerialTransport
+from starhil.protocol.transports.serial import open_serial
 
 REPLY_WITHIN_S: Final = 2.0
 MAPS_BETWEEN_STARS: Final = (6, 6, 6, 7)

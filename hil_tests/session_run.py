@@ -32,10 +32,10 @@ from starhil.hil_tests.script import Script, load_script
 from starhil.hil_tests.session import run_steps
 from starhil.hil_tests.steps import Control, Listen
 from starhil.hil_tests.temporary_folder import temporary_folder
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import escape_controls
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import DEFAULT_UNIT, find, not_found
+from starhil.protocol.files.bundled import DEFAULT_UNIT, find, not_found
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.unit import load_unit
 
 DEFAULT_FOLDER: Final = Path("out") / "session"
 STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED: ("-", "yellow")}

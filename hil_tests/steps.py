@@ -40,13 +40,12 @@ from starhil.hil_tests.raw_traffic import matches, parse_frame, pattern, send_an
 from starhil.hil_tests.results import summarize
 from starhil.hil_tests.transactions import Ack, Reading
 from starhil.hil_tests.truth_log import TruthLogReader
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.codec import Field as RowField
-from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.errors import OneLineError, ProtocolError
-from starhil.protocol.names import did_you_mean, remedy
-from starhil.protocol.values import FLAGS, EnumDefinition, Parameter, Value
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.errors import OneLineError, ProtocolError, did_you_mean, remedy
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Field as RowField
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.values import FLAGS, EnumDefinition, Parameter, Value
 
 ATTITUDE_FIELDS: Final = frozenset({"q_x", "q_y", "q_z"})
 MS_PER_S: Final = 1e3

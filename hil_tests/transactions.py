@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE
-from starhil.protocol.values import Value
+from starhil.protocol.icd.values import Value
 
 __tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 

@@ -10,7 +10,7 @@ from typing import Final
 
 from starhil.hil_tests.attitude import Quaternion, interpolate, unit
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.user_file import read_user_text
+from starhil.protocol.files.user_file import read_user_text
 
 TIME_COLUMN: Final = "time_of_exposure_s"
 QUATERNION_COLUMNS: Final = ("true_qx", "true_qy", "true_qz", "true_qw")

@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.candump import format_candump
+from starhil.protocol.can.frame import CanFrame, format_candump
 
 
 class WireLog:

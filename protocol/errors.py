@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import os
+from collections.abc import Iterable, Sequence
+from itertools import islice
 from typing import Final
 
 MAX_PROBLEMS: Final = 20
@@ -58,3 +61,39 @@ def shortened(text: str) -> str:
 def escape_controls(text: str) -> str:
     """Return text with each character escaped that could control a terminal, end the line or reorder the text."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+_MIN_SIMILARITY: Final = 0.55
+"""Similarity above which a known name is suggested for an unknown one (`difflib`)."""
+
+
+LONGEST_NAME: Final = 64
+"""Length above which nothing is suggested for an unknown name."""
+
+
+MAX_LISTED: Final = 200
+"""Number of known names that an error lists."""
+
+
+MAX_NAMES: Final = 1000
+"""Number of known names of which similar ones are suggested."""
+
+
+def remedy(name: str, known: Iterable[str]) -> str:
+    """Return `; did you mean …?` for an unknown name, or `; known: …` with all names if none is similar."""
+    names = sorted(known)
+    return did_you_mean(name, names) or f"; known: {listed(names)}"
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names separated by commas; of very many, the first."""
+    more = [f"and {len(names) - MAX_LISTED} more"] if len(names) > MAX_LISTED else []
+    return ", ".join([*names[:MAX_LISTED], *more]) or "none"
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return `; did you mean …?` with the known names most similar to an unknown one, or an empty text."""
+    if len(name) > LONGEST_NAME:
+        return ""
+    near = difflib.get_close_matches(name, list(islice(known, MAX_NAMES)), n=3, cutoff=_MIN_SIMILARITY)
+    return f"; did you mean {', '.join(near)}?" if near else ""

@@ -15,7 +15,7 @@ Example of `unit.py` beside the TOML files of a unit with `plugin = "unit.py"` i
 The function of a quantity is called with a `starhil.emulator.device.snapshot.Snapshot`, the device at one moment, from
 which the whole row is packed: it has neither the device nor a clock. docs/quantities.md lists its fields. The function of an action is called with the device and the arguments by name; it returns nothing, messages that
 follow the answer, or `bytes`, which are the data of the answer; a list of `bytes` makes several answers.
-A framing is a class derived from `starhil.protocol.framings.Framing`, whose constructor takes no arguments; a
+A framing is a class derived from `starhil.protocol.serial.framings.Framing`, whose constructor takes no arguments; a
 check is a function that returns the check of the covered bytes. docs/your-unit.md has an example of each.
 """
 
@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from starhil.protocol.errors import IcdError, ProtocolError
-from starhil.protocol.user_file import read_user_file
+from starhil.protocol.files.user_file import read_user_file
 
 Function = TypeVar("Function")
 Arguments = ParamSpec("Arguments")

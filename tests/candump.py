@@ -7,7 +7,7 @@ from pathlib import Path
 
 import can
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 
 
 def read_candump(log: Path | io.StringIO) -> list[tuple[str, CanFrame]]:

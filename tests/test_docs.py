@@ -33,10 +33,11 @@ from starhil.emulator.truth_log import COLUMNS
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.private_can_bus import hub_thread, private_can_bus
 from starhil.hil_tests.raw_traffic import parse_frame
-from starhil.protocol.can_framing import CanFrame, MessageType
+from starhil.protocol.can.cubespace import MessageType
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.export import export
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog

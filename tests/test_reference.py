@@ -16,7 +16,7 @@ from starhil.emulator.profile import load_profile
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.script import load_script
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
 
 ROOT = Path(__file__).parents[1]

@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 from starhil.emulator.cli.app import build_app
 from starhil.emulator.launch import Emulator, RunOptions
 from starhil.emulator.profile import Profile
-from starhil.protocol.framings import Receiving
-from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import FaultKind
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.serial.framings import Receiving
+from starhil.protocol.serial.stack import SerialStack
+from starhil.protocol.unit import load_unit
 from tests.emulator.conftest import FakePipeline
 from tests.emulator.runs import FakeImager
 from tests.test_docs import blocks, programs, run

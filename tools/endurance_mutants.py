@@ -25,8 +25,8 @@ from starhil.emulator.cli.endurance import run_once
 from starhil.emulator.endurance.unit_under_test import links_of
 from starhil.hil_tests.endurance.life import make_life
 from starhil.hil_tests.judge.definition import unit_of
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import bundled_units
+from starhil.protocol.unit import load_unit
+from starhil.protocol.files.bundled import bundled_units
 logging.getLogger("starhil").addHandler(logging.NullHandler())
 logging.getLogger("starhil").propagate = False
 end = float(sys.argv[1])

@@ -361,7 +361,7 @@ def accepted_options(algorithm: str) -> list[str]:
 def faults() -> str:
     """Keys of the tables of a `fault` request, except optical faults, whose keys are those of `[sky]`."""
     from starhil.emulator.faults import DeviceFault, WireFault
-    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit import load_unit
 
     enums = load_unit().enums
     rows = []
@@ -384,8 +384,9 @@ def scenario() -> str:
 
 def unit_definition() -> str:
     """Tables and keys of the files of a unit."""
-    from starhil.protocol import canopen_schema, icd_schema, link_schema, values
-    from starhil.protocol.conventions import Conventions
+    from starhil.protocol.icd import canopen_schema, link_schema, values
+    from starhil.protocol.icd import schema as icd_schema
+    from starhil.protocol.icd.conventions import Conventions
     from starhil.protocol.messages import ErrorCode
 
     headings: dict[str, type[BaseModel]] = {
@@ -449,7 +450,7 @@ def unit_definition() -> str:
 def quantities() -> str:
     """Every quantity of the device."""
     from starhil.emulator.device.quantities import QUANTITIES
-    from starhil.protocol.device_model import device_model
+    from starhil.protocol.icd.device_model import device_model
 
     enums = device_model().enums
     rows: list[Row] = []
@@ -515,7 +516,7 @@ def model_quantities() -> str:
 
 def actions() -> str:
     """Every action of the device model and its arguments."""
-    from starhil.protocol.device_model import device_model
+    from starhil.protocol.icd.device_model import device_model
 
     rows: list[Row] = []
     for action in device_model().actions.values():
@@ -529,7 +530,7 @@ def actions() -> str:
 
 def device_parameters() -> str:
     """Every parameter of the device model."""
-    from starhil.protocol.device_model import device_model
+    from starhil.protocol.icd.device_model import device_model
 
     rows: list[Row] = [
         (

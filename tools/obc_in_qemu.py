@@ -23,7 +23,7 @@ import numpy as np
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.protocol.export import export_folder
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 
 SOURCE = Path(__file__).parent / "obc"

@@ -29,7 +29,7 @@ from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import load_profile
 from starhil.emulator.truth.source import TruthState
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 from starid.storage.results import Results
 

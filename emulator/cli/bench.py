@@ -13,7 +13,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import DeviceAddress, Seed, SerialDialect, Unit, checked_dialect
-from starhil.protocol.names import DEFAULT_UNIT
+from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starid.cli.options import AsJson, one_of
 from starid.cli.output import Column, output_help, prepare_output, print_table, progress
 
@@ -188,7 +188,7 @@ class TargetOptions:
     def target(self) -> Target:
         """Return the links."""
         from starhil.emulator.cli.bench_bus import Target
-        from starhil.protocol.cubespace import Dialect
+        from starhil.protocol.serial.cubespace import Dialect
 
         dialect = Dialect(checked_dialect(self.dialect) or "b")
         return Target(self.can, self.serial, self.canopen, self.device_address, self.baud, dialect)
@@ -224,7 +224,7 @@ def bus(
 
     from starhil.emulator.cli.bench_bus import check_rows, measure, print_figures, started_device
     from starhil.hil_tests.realtime import set_realtime_priority
-    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit import load_unit
 
     running = device.target()
     icd = load_unit(unit)

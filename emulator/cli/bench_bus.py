@@ -19,8 +19,8 @@ from starhil.hil_tests.latency import REQUESTED_ROWS
 from starhil.hil_tests.load_figures import CanLoad, Jitter, SerialLoad
 from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.hil_tests.serial_load import load_serial
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.serial.cubespace import Dialect
 
 UPDATE_RATE_HZ = 10.0
 NODE = 44

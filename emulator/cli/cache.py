@@ -65,7 +65,7 @@ def warm(
     from starhil.emulator.pipeline.worker_process import WorkerProcess
     from starhil.emulator.pipeline_setup import pipeline_setup
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
-    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit import load_unit
     from starid.storage.cache import cache_dir, kernels_written_since
 
     begin_s = time.time()

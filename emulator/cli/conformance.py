@@ -12,13 +12,13 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import BenchOptions, Settings, checked_dialect
-from starhil.protocol.names import DEFAULT_UNIT
+from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starid.cli.options import AsJson
 from starid.cli.output import output_help
 
 if TYPE_CHECKING:
     from starhil.hil_tests.conformance.conformance_run import ConformanceRequest
-    from starhil.protocol.definition import InterfaceDefinition
+    from starhil.protocol.icd import InterfaceDefinition
 
 
 def links_of(icd: InterfaceDefinition, node: int | None) -> tuple[str | None, str | None, int | None]:
@@ -74,7 +74,7 @@ class CaseOptions:
         from starhil.hil_tests.conformance.conformance_run import ConformanceRequest
         from starhil.hil_tests.conformance.link_probe import ProbeTimes
         from starhil.hil_tests.errors import BenchError
-        from starhil.protocol.icd import load_unit
+        from starhil.protocol.unit import load_unit
 
         serial, can, canopen = bench.serial, bench.can, self.canopen
         if (bench.start or list_only) and serial is None and can is None:

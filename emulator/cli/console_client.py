@@ -10,7 +10,7 @@ from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError, LinkLostError, NackError, NoReplyError
 from starhil.hil_tests.links import CanHostLink, HostLink, SerialHostLink
-from starhil.protocol.codec import Row
+from starhil.protocol.icd.codec import Row
 
 
 class ConsoleClient:

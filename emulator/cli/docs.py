@@ -11,7 +11,7 @@ import typer
 
 from starhil.emulator.cli.output import print_text
 from starhil.emulator.errors import EmulatorError
-from starhil.protocol.names import remedy
+from starhil.protocol.errors import remedy
 
 _FOLDER: Final = Path(__file__).resolve().parents[2] / "docs"
 """Folder of the pages in the installation or checkout."""

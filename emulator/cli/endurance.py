@@ -58,7 +58,7 @@ class PlanOptions:
 
     def plan(self) -> Iterator[tuple[str, int, int, str]]:
         """Generate unit, seed, steps and kind of each life; a kind has a period, in which its last life is of it."""
-        from starhil.protocol.names import bundled_units
+        from starhil.protocol.files.bundled import bundled_units
 
         units = self.unit or sorted(bundled_units())
         kinds = {"rendered": (self.rendered, RENDERED_STEPS), "long": (self.long, LONG_STEPS)}
@@ -136,7 +136,7 @@ def live_from_seed(unit: str, seed: int, steps: int, kind: str, folder: Path) ->
     from starhil.emulator.endurance.unit_under_test import links_of
     from starhil.hil_tests.endurance.life import make_life
     from starhil.hil_tests.judge.definition import unit_of
-    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit import load_unit
 
     icd = load_unit(unit)
     life = make_life(
@@ -186,7 +186,7 @@ def run_once(life: Any, *, record: Path | None = None) -> Any:
     from starhil.emulator.endurance.unit_under_test import UnitUnderTest
     from starhil.hil_tests.endurance.run import LifeRun
     from starhil.hil_tests.judge.definition import unit_of
-    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit import load_unit
 
     icd = load_unit(life.unit)
     with tempfile.TemporaryDirectory(dir=IN_MEMORY if IN_MEMORY.is_dir() else None) as folder:
@@ -241,7 +241,7 @@ def read_life(path: Path) -> Any:
     """Read a life that `write_life` has written."""
     from starhil.emulator.errors import EmulatorError
     from starhil.hil_tests.endurance.life import Life
-    from starhil.protocol.user_file import read_user_text
+    from starhil.protocol.files.user_file import read_user_text
 
     try:
         content = json.loads(read_user_text(path))

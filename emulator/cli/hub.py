@@ -26,7 +26,7 @@ def command(
     import signal
 
     from starhil.emulator.guard import log_loop_errors_once
-    from starhil.protocol.hub import DEFAULT_BUS, CanHub
+    from starhil.protocol.transports.hub import DEFAULT_BUS, CanHub
 
     if log is not None:
         prepare_output(log, "--log")

@@ -10,7 +10,7 @@ import typer
 
 from starhil.emulator.cli.options import Unit
 from starhil.emulator.cli.output import print_text, writing
-from starhil.protocol.names import DEFAULT_UNIT
+from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starid.cli.options import AsJson
 from starid.cli.output import output_help
 
@@ -59,7 +59,7 @@ def export(
     """
     from starhil.emulator.errors import EmulatorError
     from starhil.protocol import export as formats
-    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit import load_unit
 
     definition, name = load_unit(unit), format_.value
     if name in formats.FOLDER_FORMATS:
@@ -88,7 +88,7 @@ def list_rows(unit: Unit = DEFAULT_UNIT, as_json: AsJson = False) -> None:
     """List telecommands, telemetry and parameters, one per line."""
     import json
 
-    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit import load_unit
 
     definition = load_unit(unit)
     if as_json:

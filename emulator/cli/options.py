@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeAlias
 
 import typer
 
-from starhil.protocol.names import Kind, bundled
+from starhil.protocol.files.bundled import Kind, bundled
 from starid.cli.options import one_of
 from starid.cli.output import output_help
 

@@ -168,7 +168,7 @@ def _scene(profile: str | None) -> tuple[Camera, SensorModel, SkyView, StarCatal
     from starhil.emulator.device.surroundings import orbit_of
     from starhil.emulator.pipeline_setup import pipeline_setup
     from starhil.emulator.profile import load_profile
-    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit import load_unit
 
     loaded = load_profile(profile)
     icd = load_unit(loaded.unit_source)

@@ -276,7 +276,7 @@ async def _serve(make: Callable[[], Emulator]) -> int:
 
 def _absolute_folder(unit: str) -> str:
     """Return a folder from the command line as an absolute path; a profile would resolve it differently."""
-    from starhil.protocol.names import bundled_units, find_unit
+    from starhil.protocol.files.bundled import bundled_units, find_unit
 
     return unit if unit in bundled_units() else str(find_unit(unit).absolute())
 

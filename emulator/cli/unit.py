@@ -10,7 +10,7 @@ import typer
 
 from starhil.emulator.cli.options import names_of
 from starhil.emulator.cli.output import print_text
-from starhil.protocol.names import DEFAULT_UNIT
+from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starid.cli.options import AsJson
 
 group = typer.Typer(
@@ -35,8 +35,8 @@ UnitArgument = Annotated[
 @group.command("list")
 def list_units(as_json: AsJson = False) -> None:
     """List the bundled units."""
-    from starhil.protocol.icd import load_unit
-    from starhil.protocol.names import bundled_units
+    from starhil.protocol.files.bundled import bundled_units
+    from starhil.protocol.unit import load_unit
 
     units = {name: load_unit(name) for name in bundled_units()}
     if as_json:
@@ -65,7 +65,7 @@ def new(
 ) -> None:
     """Create a unit: a commented definition that already runs, as a starting point."""
     from starhil.emulator.errors import EmulatorError, explained
-    from starhil.protocol.names import SKELETON
+    from starhil.protocol.files.bundled import SKELETON
     from starid.storage.files import write_atomically
 
     if folder.exists() and (not folder.is_dir() or any(folder.glob("*.toml"))):
@@ -96,7 +96,7 @@ def check(
     status is 0 if there are no errors, otherwise 1.
     """
     from starhil.protocol.export.describe import value_text
-    from starhil.protocol.unit_examples import examine
+    from starhil.protocol.unit.examples import examine
 
     definition, errors, examples = examine(unit, run_plugin=not no_plugin)
     skipped = definition.plugin.skipped if no_plugin else None
@@ -137,7 +137,7 @@ def check(
 @group.command("describe")
 def describe(unit: UnitArgument = DEFAULT_UNIT, as_json: AsJson = False) -> None:
     """Describe a unit: links, conventions, and the binding of each field."""
-    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit import load_unit
 
     icd = load_unit(unit)
     if as_json:

@@ -16,9 +16,9 @@ from starhil.emulator.head import Head
 from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.run import Run
 from starhil.emulator.sky.objects import SkyObjects
-from starhil.protocol.codec import Field, Row
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.names import bundled
+from starhil.protocol.files.bundled import bundled
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Field, Row
 from starid.catalog import load_catalog
 from starid.catalog.star_names import STAR_NAMES
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, Protocol
 
 from starhil.emulator.errors import EmulatorError
-from starhil.protocol.codec import Field, Row
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import escape_controls
-from starhil.protocol.values import FieldError, Value
+from starhil.protocol.icd import FieldError, InterfaceDefinition
+from starhil.protocol.icd.codec import Field, Row
+from starhil.protocol.icd.values import Value
+from starhil.protocol.serial.cubespace import Dialect
 
 Bus = Literal["can", "canopen", "serial"]
 

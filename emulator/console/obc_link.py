@@ -10,7 +10,7 @@ from starhil.emulator.head import Head
 from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.icd import InterfaceDefinition
 
 
 async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[], object]]) -> ObcClient:

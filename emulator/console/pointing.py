@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.config import AttitudeConfig
-from starhil.protocol.validation_messages import problems
+from starhil.protocol.files.validation import problems
 from starid.attitude import Attitude
 from starid.catalog import load_catalog
 from starid.catalog.star_names import STAR_NAMES

@@ -30,7 +30,7 @@ from starhil.emulator.guard import log_internal_error
 from starhil.emulator.head import Head
 from starhil.emulator.links.traffic import Decoder, WireItem
 from starhil.emulator.output_file import OutputFile
-from starhil.protocol.codec import Row
+from starhil.protocol.icd.codec import Row
 
 log = logging.getLogger("starhil.record")
 

@@ -21,7 +21,7 @@ from starhil.emulator.control.token import is_token
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.json_lines import JsonError, parse_object
 from starhil.protocol.errors import reason
-from starhil.protocol.flow import REQUEST_S, ConnectionLimit, limit_unsent
+from starhil.protocol.transports.connections import REQUEST_S, ConnectionLimit, limit_unsent
 
 log = logging.getLogger("starhil.console")
 

@@ -9,15 +9,15 @@ from dataclasses import replace
 from typing import Any, Final
 
 from starhil.emulator.links.traffic import Decoder, Traffic, WireItem
-from starhil.protocol.can_framing import CanFrame, encode_request_frames
-from starhil.protocol.candump import bus_name, format_candump
+from starhil.protocol.can.cubespace import encode_request_frames
+from starhil.protocol.can.frame import CanFrame, bus_name, format_candump
 from starhil.protocol.canopen.cob import SDO_RECEIVE
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import requests_of, row_transfer
-from starhil.protocol.codec import Row
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.serial.stack import SerialStack
 
 KEPT_ITEMS: Final = 20_000
 """Number of items kept for export."""

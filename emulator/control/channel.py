@@ -40,10 +40,9 @@ from starhil.emulator.run import Run
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth_log import compare
-from starhil.protocol.errors import ProtocolError
-from starhil.protocol.flow import REQUEST_S, ConnectionLimit
-from starhil.protocol.names import did_you_mean, remedy
-from starhil.protocol.validation_messages import problems
+from starhil.protocol.errors import ProtocolError, did_you_mean, remedy
+from starhil.protocol.files.validation import problems
+from starhil.protocol.transports.connections import REQUEST_S, ConnectionLimit
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")

@@ -32,8 +32,8 @@ from starhil.emulator.head import Head
 from starhil.emulator.toml_file import find_toml, read_toml
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.truth import Truth
-from starhil.protocol.names import did_you_mean
-from starhil.protocol.validation_messages import problems
+from starhil.protocol.errors import did_you_mean
+from starhil.protocol.files.validation import problems
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")

@@ -20,8 +20,8 @@ from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.subscriptions import Subscription
+from starhil.protocol.icd.values import MessageError, Value
 from starhil.protocol.messages import ErrorCode, Reply
-from starhil.protocol.values import MessageError, Value
 
 Arguments: TypeAlias = Mapping[str, Any]
 """Values by argument; `parameters` has the values of fields that are bound to a parameter."""

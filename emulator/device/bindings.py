@@ -11,15 +11,15 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.quantities import Getter, getter_of
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.snapshot import Snapshot
-from starhil.protocol.checks import crc
-from starhil.protocol.codec import Field, Row
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.device_model import HEALTH, HEALTH_DEFAULTS, PARAMETER
-from starhil.protocol.icd_bindings import quantity_of
-from starhil.protocol.icd_layout import text_of
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Field, Row
+from starhil.protocol.icd.device_model import HEALTH, HEALTH_DEFAULTS, PARAMETER
+from starhil.protocol.icd.units_of_measure import factor
+from starhil.protocol.icd.values import Value
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
-from starhil.protocol.units_of_measure import factor
-from starhil.protocol.values import Value
+from starhil.protocol.serial.checks import crc
+from starhil.protocol.unit.bindings import quantity_of
+from starhil.protocol.unit.layout import text_of
 
 
 class TelemetryBinding:

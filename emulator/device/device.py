@@ -32,11 +32,11 @@ from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.pipeline.messages import IDENTITY, Quaternion
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import TruthSource
-from starhil.protocol.codec import Field
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.units_of_measure import factor
-from starhil.protocol.values import Value
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Field
+from starhil.protocol.icd.units_of_measure import factor
+from starhil.protocol.icd.values import Value
 
 log = logging.getLogger("starhil.device")
 

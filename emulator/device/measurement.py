@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.pipeline.messages import ZERO, FrameResult, Triple
 from starhil.emulator.truth.source import TruthState
-from starhil.protocol.conventions import NANOSECONDS
+from starhil.protocol.icd.conventions import NANOSECONDS
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from typing import Any, Final
 from starhil.emulator.device.navigation import perigee_below_surface
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import SolverSettings
-from starhil.protocol.codec import STRUCT_CODES
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.values import FieldError, MessageError, Parameter, Value
+from starhil.protocol.icd import FieldError, InterfaceDefinition
+from starhil.protocol.icd.codec import STRUCT_CODES
+from starhil.protocol.icd.values import MessageError, Parameter, Value
 
 ParameterValue = bool | int | float | str
 

@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import Final
 
 from starhil.emulator.profile_sections import PowerConfig, ThermalConfig
-from starhil.protocol.conventions import NANOSECONDS
+from starhil.protocol.icd.conventions import NANOSECONDS
 
 MILLI: Final = 1e-3
 

@@ -21,9 +21,9 @@ from starhil.emulator.device.reported import SEQUENCES
 from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.device.stored_images import BMP_TYPE, StoredImage, msdos_time
 from starhil.emulator.pipeline.messages import MatchedStar, Triple, as_triple
-from starhil.protocol.conventions import DAY_NS, NANOSECONDS
-from starhil.protocol.device_model import HEALTH, PARAMETER, generic, number_in
-from starhil.protocol.icd_schema import QuantityModel
+from starhil.protocol.icd.conventions import DAY_NS, NANOSECONDS
+from starhil.protocol.icd.device_model import HEALTH, PARAMETER, QuantityModel, generic, number_in
+from starhil.protocol.icd.values import Parameter, Value
 from starhil.protocol.image_transfer import (
     burst_packet,
     file_checksum,
@@ -31,7 +31,6 @@ from starhil.protocol.image_transfer import (
     parse_burst_packet,
 )
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.values import Parameter, Value
 
 Getter: TypeAlias = Callable[[Snapshot], Value | None]
 Kind = TypeVar("Kind", bool, int, float, str, bytes)

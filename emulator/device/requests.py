@@ -14,9 +14,9 @@ from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.guard import log_internal_error
-from starhil.protocol.codec import Row
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.values import MessageError
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.values import MessageError
 
 log = logging.getLogger("starhil.device")
 

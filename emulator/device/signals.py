@@ -25,7 +25,7 @@ from typing import Any
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
 from starhil.emulator.signals import Signal
-from starhil.protocol.codec import Row
+from starhil.protocol.icd.codec import Row
 from starhil.protocol.messages import Reply
 
 

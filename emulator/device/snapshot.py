@@ -20,9 +20,9 @@ from starhil.emulator.device.reported import Reported, reported
 from starhil.emulator.device.stored_images import FileState, ImageState, StoredImage
 from starhil.emulator.pipeline.messages import MatchedStar, Quaternion
 from starhil.emulator.profile_sections import DeviceConfig
-from starhil.protocol.codec import Field
-from starhil.protocol.conventions import Conventions
-from starhil.protocol.values import Parameter, Value
+from starhil.protocol.icd.codec import Field
+from starhil.protocol.icd.conventions import Conventions
+from starhil.protocol.icd.values import Parameter, Value
 
 Result = TypeVar("Result")
 

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any, Final, TypeAlias
 
 from starhil.emulator.errors import EmulatorError, explained
-from starhil.protocol.durable_file import replace_durably
-from starhil.protocol.user_file import UnsuitableFileError, read_user_file
+from starhil.protocol.files.durable_file import replace_durably
+from starhil.protocol.files.user_file import UnsuitableFileError, read_user_file
 
 FORMAT: Final = 1
 STATE_FILE: Final = "device.json"

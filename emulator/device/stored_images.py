@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.pipeline.binning import mean_over_squares
-from starhil.protocol.conventions import NANOSECONDS
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.image_transfer import FRAME_SIZE, HoleMap, file_checksum
 
 BMP_TYPE: Final = 4

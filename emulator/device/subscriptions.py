@@ -12,8 +12,8 @@ from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.signals import Signals
-from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Row
 
 LONGEST_PERIOD_NS: Final = 1e18
 """Period of a row whose rate is hardly above zero, nanoseconds: longer than any run."""

@@ -28,8 +28,8 @@ from starhil.emulator.pump import MAX_STEP_S
 from starhil.emulator.run import Run
 from starhil.emulator.tape import Wiring
 from starhil.emulator.truth.config import TruthConfig
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 

@@ -15,7 +15,7 @@ from jinja2 import StrictUndefined, Template
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.fmu.variables import TEXT_SIZE, Fmi, Variable, variables
-from starhil.protocol.quoting import c_string
+from starhil.protocol.icd.quoting import c_string
 from starid.storage.files import write_atomically
 
 FOLDER: Final = Path(__file__).parent

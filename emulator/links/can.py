@@ -13,15 +13,8 @@ from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS
-from starhil.protocol.can_framing import (
-    MAX_EXTENDED_ID,
-    MAX_FRAME_DATA,
-    MAX_STANDARD_ID,
-    CanDeviceReceiver,
-    CanFrame,
-    CanId,
-    encode_reply_frames,
-)
+from starhil.protocol.can.cubespace import CanDeviceReceiver, CanId, encode_reply_frames
+from starhil.protocol.can.frame import MAX_EXTENDED_ID, MAX_FRAME_DATA, MAX_STANDARD_ID, CanFrame
 from starhil.protocol.messages import Reply, Request
 from starhil.protocol.transports.base import Transport
 

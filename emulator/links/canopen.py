@@ -21,7 +21,7 @@ from starhil.emulator.links.base import BusLink
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanDamage
 from starhil.emulator.pipeline.messages import ImageResult
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
 from starhil.protocol.canopen.cob import SDO_RECEIVE
@@ -31,11 +31,11 @@ from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, ParameterStorage, StorageError
-from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.values import MessageError, Value
 from starhil.protocol.messages import Reply
 from starhil.protocol.transports.base import Transport
-from starhil.protocol.values import MessageError, Value
 
 log = logging.getLogger("starhil.canopen")
 

@@ -9,9 +9,9 @@ from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
-from starhil.protocol.cubespace import Dialect
 from starhil.protocol.messages import Receiver, Reply, Request
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.serial.stack import SerialStack
 from starhil.protocol.transports.paced import SerialTransport
 
 JUNK_BYTES: Final = 8

@@ -10,14 +10,15 @@ from typing import Any, Final
 
 from starhil.emulator.links.base import Link
 from starhil.emulator.signals import Signal
-from starhil.protocol.can_framing import REQUEST_KINDS, CanDeviceReceiver, CanFrame, CanHostReceiver, CanId
-from starhil.protocol.codec import Row
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.can.cubespace import REQUEST_KINDS, CanDeviceReceiver, CanHostReceiver, CanId
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.values import Value
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_stack import HostReceiver, SerialStack
-from starhil.protocol.values import Value
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.serial.stack import HostReceiver, SerialStack
 
 SHOWN_VALUES: Final = 8
 

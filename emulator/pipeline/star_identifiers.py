@@ -18,7 +18,7 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import CatalogUpset
-from starhil.protocol.names import remedy
+from starhil.protocol.errors import remedy
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError

@@ -10,7 +10,7 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.noise import Digitizer
-from starhil.protocol.names import remedy
+from starhil.protocol.errors import remedy
 from starid.arrays import Array
 from starid.attitude import ARCSEC_PER_RAD
 from starid.camera import Camera

@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
-from starhil.protocol.names import remedy
+from starhil.protocol.errors import remedy
 from starid.arrays import Array
 
 _MAX_OBJECTS: Final = 100_000

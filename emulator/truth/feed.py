@@ -14,7 +14,7 @@ from starhil.emulator.json_lines import read_lines
 from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError
 from starhil.emulator.truth.live import RESTART_S, LiveTruth
 from starhil.protocol.errors import reason
-from starhil.protocol.flow import ConnectionLimit
+from starhil.protocol.transports.connections import ConnectionLimit
 
 log = logging.getLogger("starhil.truth")
 

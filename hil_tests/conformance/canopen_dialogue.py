@@ -86,7 +86,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
 from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, check, check_equal
 from starhil.hil_tests.conformance.case_file import text_cases
 from starhil.hil_tests.judge.canopen import ABORT, HEARTBEAT, SDO_RESPONSE, SEGMENT, SYNC
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.errors import did_you_mean
 
 LONGEST_TIMEOUT_S: Final = 12.0
 """Maximum time in which a node aborts a transfer whose client stops sending."""

@@ -44,9 +44,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal
 from starhil.hil_tests.conformance.link_probe import LinkProbe
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.names import did_you_mean
-from starhil.protocol.user_file import TomlError, read_user_toml
-from starhil.protocol.validation_messages import problems
+from starhil.protocol.errors import did_you_mean
+from starhil.protocol.files.user_file import TomlError, read_user_toml
+from starhil.protocol.files.validation import problems
 
 CUBESPACE_CASES: Final = Path(__file__).with_name("cubespace_cases.toml")
 IN_BRACES: Final = re.compile(r"\{(\w+)\}")

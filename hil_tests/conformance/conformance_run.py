@@ -38,10 +38,11 @@ from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.errors import IcdError
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import DEFAULT_UNIT
-from starhil.protocol.serial_stack import chosen_dialect
-from starhil.protocol.transports import open_can, open_serial
+from starhil.protocol.files.bundled import DEFAULT_UNIT
+from starhil.protocol.serial.stack import chosen_dialect
+from starhil.protocol.transports.can import open_can
+from starhil.protocol.transports.serial import open_serial
+from starhil.protocol.unit import load_unit
 
 if TYPE_CHECKING:
     from starhil.hil_tests.conformance.canopen_probe import CanopenProbe

@@ -9,9 +9,9 @@ from typing import Generic, Protocol, Self, TypeVar
 
 from starhil.hil_tests.errors import LinkLostError
 from starhil.hil_tests.loop_thread import LoopThread
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.transports import Transport
+from starhil.protocol.transports.base import Transport
 
 __all__ = ["CanFrame", "LivePort", "Port"]
 

@@ -16,7 +16,7 @@ from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge import canopen
 from starhil.hil_tests.judge.definition import Unit
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 
 DEVICE_ERROR: Final = 0xFF00
 """Base of the EMCY error codes of the error mode (docs/canopen.md)."""

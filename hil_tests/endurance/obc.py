@@ -20,7 +20,7 @@ from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request, Value
 from starhil.hil_tests.judge.rows import Row
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 
 TIME_OUT_S: Final = 0.7
 """Silence after which a unit has dropped an incomplete message."""

@@ -18,7 +18,7 @@ from starhil.hil_tests.endurance.violation import Known, Violation
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Request, Value
 from starhil.hil_tests.judge.rows import PARAMETER, Field, Row
-from starhil.protocol.units_of_measure import factor
+from starhil.protocol.icd.units_of_measure import factor
 
 BOOT_S: Final = 0.6
 """Longest boot of the profile of a run."""

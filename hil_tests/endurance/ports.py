@@ -12,7 +12,7 @@ from starhil.hil_tests.judge import can, canopen
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request
 from starhil.hil_tests.judge.serial import SerialLine
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 
 HOST: Final = 1
 """CAN address of the OBC."""

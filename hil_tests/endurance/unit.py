@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 
 
 class LiveUnit(Protocol):

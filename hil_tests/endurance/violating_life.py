@@ -13,7 +13,7 @@ from starhil.hil_tests.judge import can
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Request
 from starhil.hil_tests.judge.serial import SerialLine
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 
 LONGEST_WAIT_S = 3600.0
 

@@ -16,10 +16,10 @@ from typing import Any
 from starhil.hil_tests.judge.framings import Measure, Taken
 from starhil.hil_tests.judge.messages import PUBLISHED, Request, Value
 from starhil.hil_tests.judge.rows import PARAMETER, SIZES, Field, Row, single
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.framings import Receiving
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import find_unit
+from starhil.protocol.files.bundled import find_unit
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.serial.framings import Receiving
+from starhil.protocol.unit import load_unit
 
 
 @dataclass(frozen=True)

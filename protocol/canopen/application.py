@@ -7,9 +7,9 @@ from typing import Protocol
 
 from starhil.protocol.canopen.abort import ABORTS, AbortCode, SdoAbortError
 from starhil.protocol.canopen.dictionary import Deferred
-from starhil.protocol.codec import Row
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.values import LengthError, MessageError, Value
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.values import LengthError, MessageError, Value
 
 
 @dataclass(frozen=True)

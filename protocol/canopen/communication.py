@@ -12,7 +12,7 @@ from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVari
 
 from starhil.protocol.canopen.cob import BIT_30, INVALID
 from starhil.protocol.canopen.pdo_mapping import LARGEST_MAPPING, Direction
-from starhil.protocol.canopen_schema import CanopenModel, PdoModel
+from starhil.protocol.icd.canopen_schema import CanopenModel, PdoModel
 
 U8: Final = datatypes.UNSIGNED8
 U16: Final = datatypes.UNSIGNED16

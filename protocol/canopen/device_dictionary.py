@@ -24,11 +24,11 @@ from starhil.protocol.canopen.communication import (
 )
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Entry, Value, encode, type_size
 from starhil.protocol.canopen.pdo_mapping import Direction, resolve_all
-from starhil.protocol.canopen_schema import PackedField, PdoModel, PlacedMember, PlacedObject
-from starhil.protocol.codec import Field, Row, Slot
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import IcdError
-from starhil.protocol.values import MessageError, Parameter, representable
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.canopen_schema import PackedField, PdoModel, PlacedMember, PlacedObject
+from starhil.protocol.icd.codec import Field, Row, Slot
+from starhil.protocol.icd.values import MessageError, Parameter, representable
 
 LARGEST_SUBINDEX: Final = 254
 """Highest sub-index of a member (CiA 301: 255 is reserved)."""

@@ -12,7 +12,7 @@ from typing import Final
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.protocol.canopen.dictionary import Dictionary, encode
-from starhil.protocol.quoting import Scope, eds_text
+from starhil.protocol.icd.quoting import Scope, eds_text
 
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 MANUFACTURER: Final = range(0x2000, 0x6000)

@@ -9,7 +9,7 @@ from typing import Final
 
 from starhil.protocol.canopen.abort import SdoAbortError
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, Key, in_order, span_of
-from starhil.protocol.codec import Row, Slot
+from starhil.protocol.icd.codec import Row, Slot
 
 SdoTransfer = Generator[bytes, bytes, bytes]
 """Returns the data of an upload, or no data after a download; raises `SdoAbortError` on an abort."""

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import SdoAbortError
 from starhil.protocol.canopen.cob import ERROR_CONTROL, LSS_MASTER, NMT, SDO_RECEIVE
 from starhil.protocol.canopen.context import UNCONFIGURED, Context, EventKind, NmtState, SlaveEvent

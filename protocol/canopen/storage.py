@@ -8,9 +8,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from starhil.protocol.durable_file import replace_durably
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.user_file import read_user_file
+from starhil.protocol.files.durable_file import replace_durably
+from starhil.protocol.files.user_file import read_user_file
 
 COMMUNICATION: Final = "communication"
 LSS: Final = "lss"

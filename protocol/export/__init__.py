@@ -7,8 +7,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import Final, cast
 
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
 
 FORMATS: Final = ("markdown", "html", "dbc", "eds", "xtce", "cosmos")
 """Formats that are a single text."""

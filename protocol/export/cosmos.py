@@ -9,13 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Final
 
-from starhil.protocol.codec import Field, Row
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import IcdError
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.export.packets import key_bits, key_of, wire_order
-from starhil.protocol.quoting import Scope, cosmos_name, cosmos_state, cosmos_string
-from starhil.protocol.values import EnumDefinition
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Field, Row
+from starhil.protocol.icd.quoting import Scope, cosmos_name, cosmos_state, cosmos_string
+from starhil.protocol.icd.values import EnumDefinition
 
 TARGET: Final = "STARHIL"
 IDENTIFIER: Final = "PACKET_ID"

@@ -10,22 +10,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
-from starhil.protocol.can_framing import (
-    MAX_FRAME_DATA,
-    REPLY_TYPES,
-    REQUEST_TYPES,
-    CanId,
-    MessageType,
-    nack_type,
-)
-from starhil.protocol.codec import Field, Row, Slot
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.can.cubespace import REPLY_TYPES, REQUEST_TYPES, CanId, MessageType, nack_type
+from starhil.protocol.can.frame import MAX_FRAME_DATA
 from starhil.protocol.errors import IcdError
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.export.templates import fill
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Field, Row, Slot
+from starhil.protocol.icd.quoting import Scope, dbc_string
+from starhil.protocol.icd.values import EnumDefinition
 from starhil.protocol.messages import ErrorCode, ReplyKind
-from starhil.protocol.quoting import Scope, dbc_string
-from starhil.protocol.values import EnumDefinition
 
 EXTENDED: Final = 0x80000000
 """Flag of a 29-bit CAN ID in DBC files."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from starhil.protocol.codec import Field, Row
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.wire import texts_of
-from starhil.protocol.unit_examples import Exchange, exchanges
-from starhil.protocol.values import EnumDefinition, Parameter, Section, Value
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Field, Row
+from starhil.protocol.icd.values import EnumDefinition, Parameter, Section, Value
+from starhil.protocol.unit.examples import Exchange, exchanges
 
 FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning", "Example")
 PARAMETER_COLUMNS: Final = ["ID", "Parameter", "Type", "Unit", "Range", "Default", "Meaning"]

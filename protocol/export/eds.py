@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.icd import InterfaceDefinition
 
 
 def render(icd: InterfaceDefinition) -> str:

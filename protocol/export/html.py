@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export import describe, wire
 from starhil.protocol.export.templates import fill
-from starhil.protocol.quoting import html_text
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.quoting import html_text
 
 
 def render(icd: InterfaceDefinition) -> str:

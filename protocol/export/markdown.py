@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Final
 
-from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export import describe, wire
 from starhil.protocol.export.templates import fill
-from starhil.protocol.quoting import markdown, one_line
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.quoting import markdown, one_line
 
 _ROW_COLUMNS: Final = ("ID", "Name", "Bytes", "Source", "Meaning")
 

@@ -8,11 +8,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from starhil.protocol.codec import Field, Row
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import IcdError
-from starhil.protocol.link_schema import CustomCheck, CustomFraming, FixedFraming, LengthFraming, MessageClass
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Field, Row
+from starhil.protocol.icd.link_schema import (
+    CustomCheck,
+    CustomFraming,
+    FixedFraming,
+    LengthFraming,
+    MessageClass,
+)
+from starhil.protocol.serial.stack import SerialStack
 
 CLASS_SHIFT: Final = 8
 """Position of the class code, in bits."""

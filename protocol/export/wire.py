@@ -9,20 +9,20 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from starhil.protocol.can_framing import MessageType
-from starhil.protocol.canopen_schema import CanopenModel, PdoModel, PlacedObject
-from starhil.protocol.conventions import EPOCHS, Order
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.can.cubespace import MessageType
 from starhil.protocol.export.templates import text_of
-from starhil.protocol.link_schema import (
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.canopen_schema import CanopenModel, PdoModel, PlacedObject
+from starhil.protocol.icd.conventions import EPOCHS, Order
+from starhil.protocol.icd.link_schema import (
     CountedMessage,
     CubeSpaceFraming,
     FormatModel,
     HeaderFieldModel,
     SerialLinkModel,
 )
+from starhil.protocol.icd.values import Section
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.values import Section
 
 
 def texts_of(table: str) -> dict[str, Any]:

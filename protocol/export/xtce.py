@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from starhil.protocol.codec import Field, Row
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.export.packets import key_bits, key_of, wire_order
 from starhil.protocol.export.templates import fill
-from starhil.protocol.quoting import Scope, xtce_name, xtce_text
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Field, Row
+from starhil.protocol.icd.quoting import Scope, xtce_name, xtce_text
 
 NAMESPACE: Final = "http://www.omg.org/spec/XTCE/20180204"
 PACKET: Final = "Packet"

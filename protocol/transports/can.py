@@ -12,9 +12,9 @@ from typing import Any, Final
 import can
 from can.interfaces.socketcan import SocketcanBus
 
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.transports.base import Transport, TransportError
+from starhil.protocol.transports.hub import DEFAULT_BUS, DEFAULT_HOST, DEFAULT_PORT
 from starhil.protocol.transports.hub_client import AutoHubTransport, HubTransport
 from starhil.protocol.transports.python_can import PythonCanTransport
 

@@ -7,12 +7,12 @@ import contextlib
 import logging
 from typing import Final
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.can.socketcand import CommandError, CommandSplitter, format_send, parse_frame
 from starhil.protocol.errors import ProtocolError, reason
-from starhil.protocol.flow import TURN, detect_lost_peer, limit_buffers
-from starhil.protocol.hub import DEFAULT_BUS, CanHub
-from starhil.protocol.socketcand import CommandError, CommandSplitter, format_send, parse_frame
 from starhil.protocol.transports.base import ReconnectingTransport, TransportError
+from starhil.protocol.transports.connections import TURN, detect_lost_peer, limit_buffers
+from starhil.protocol.transports.hub import DEFAULT_BUS, CanHub
 
 _LOGGER: Final = logging.getLogger("starhil.transport")
 

@@ -19,8 +19,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from starhil.protocol.flow import TURN
 from starhil.protocol.transports.base import TransportError
+from starhil.protocol.transports.connections import TURN
 from starhil.protocol.transports.paced import PacedTransport, termios_as_os_error, write_fd
 
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)

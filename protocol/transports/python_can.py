@@ -13,7 +13,7 @@ from typing import Final
 
 import can
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.transports.base import ReconnectingTransport, TransportError
 
 QUEUE_LIMIT: Final = 10_000

@@ -14,8 +14,8 @@ from urllib.parse import urlsplit
 import serial
 
 from starhil.protocol.errors import reason
-from starhil.protocol.flow import TURN, TurnProtocol, detect_lost_peer
 from starhil.protocol.transports.base import ReconnectingTransport, TransportError
+from starhil.protocol.transports.connections import TURN, TurnProtocol, detect_lost_peer
 from starhil.protocol.transports.paced import (
     PacedTransport,
     SerialTransport,

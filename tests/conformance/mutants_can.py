@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, CanId
+from starhil.protocol.can.cubespace import CanDeviceReceiver, CanId
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import FaultKind, LinkFault, Request, RequestKind
 from tests.conformance.mutant_seams import (
     enter,

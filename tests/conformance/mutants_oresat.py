@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.names import find_unit
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.files.bundled import find_unit
 from tests.conformance.mutant_seams import Damage, incoming, only_acknowledged, outgoing
 from tests.conformance.simulated import SimulatedUnit
 

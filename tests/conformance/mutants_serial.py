@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.link_schema import LinkModel
+from starhil.protocol.icd.link_schema import LinkModel
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.serial.stack import SerialStack
 from tests.conformance.mutant_seams import (
     enter,
     events,

@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from starhil.emulator.device.device import Device
-from starhil.protocol.codec import Row
-from starhil.protocol.message_format import MessageFormat
+from starhil.protocol.icd.codec import Row
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.serial.formats import MessageFormat
+from starhil.protocol.serial.stack import SerialStack
 from tests.conformance.mutant_seams import Damage, handling, incoming, only_acknowledged, outgoing
 from tests.conformance.simulated import SimulatedUnit
 

@@ -36,9 +36,9 @@ from starhil.hil_tests.judge.canopen import entries
 from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import DEFAULT_UNIT
+from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starhil.protocol.transports.paced import PacedTransport
+from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager
 from tests.protocol.canopen.conftest import import_eds

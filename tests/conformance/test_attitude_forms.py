@@ -17,8 +17,8 @@ from starhil.hil_tests.conformance.conformance_run import POINTING
 from starhil.hil_tests.conformance.runner import run_case
 from starhil.hil_tests.conformance.suites import serial_suite
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.conventions import Conventions
-from starhil.protocol.names import find_unit
+from starhil.protocol.files.bundled import find_unit
+from starhil.protocol.icd.conventions import Conventions
 from starid.attitude import Attitude
 from tests.conformance.links import LINKS, ROWS
 from tests.conformance.simulated import SimulatedUnit

@@ -12,7 +12,7 @@ from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite, settings_of
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.names import find_unit
+from starhil.protocol.files.bundled import find_unit
 from tests.conformance.links import write_unit
 from tests.conformance.simulated import SimulatedUnit
 

@@ -13,8 +13,8 @@ from starhil.hil_tests.conformance.runner import Outcome, run_case
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_examples import examine, exchanges
+from starhil.protocol.unit import load_unit
+from starhil.protocol.unit.examples import examine, exchanges
 from tests.conformance.links import LINKS, write_unit
 from tests.conformance.protocol_mutants import Edit, LostAimError, ProtocolMutant, read_mutants
 from tests.conformance.simulated import SimulatedUnit

@@ -13,7 +13,7 @@ from starhil.hil_tests.conformance.runner import run_cases
 from starhil.hil_tests.conformance.suites import serial_suite
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from tests.conformance.links import write_unit
 from tests.conformance.mutants_units import bodies
 from tests.conformance.simulated import SimulatedUnit

@@ -11,7 +11,7 @@ from starhil.hil_tests.conformance.canopen_suite import canopen_suite
 from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.names import UNITS_FOLDER
+from starhil.protocol.files.bundled import UNITS_FOLDER
 from tests.conformance.simulated import SimulatedUnit
 from tests.user_units import ON_CAN, STREAM, packets, written
 

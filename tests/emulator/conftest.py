@@ -29,9 +29,9 @@ from starhil.emulator.pipeline.messages import (
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth, TruthSource
-from starhil.protocol.icd import load_unit
+from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
-from starhil.protocol.names import DEFAULT_UNIT
+from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
 from tests.emulator.runs import DirectImager, FakeImager, FirstHead

@@ -14,7 +14,7 @@ import pytest
 from starhil.emulator.console import server
 from starhil.emulator.guard import log_loop_errors_once
 from starhil.emulator.launch import RunOptions
-from starhil.protocol.hub import CanHub
+from starhil.protocol.transports.hub import CanHub
 from tests.emulator.console.pages import OPTIONS, WITHIN_S
 from tests.emulator.runs import Control
 

@@ -12,7 +12,7 @@ from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import CALIBRATION, OF_FAULTS, Profile, load_profile
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.config import SlewConfig
-from starhil.protocol.names import bundled
+from starhil.protocol.files.bundled import bundled
 from starid.camera import Camera
 
 

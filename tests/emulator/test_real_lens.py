@@ -13,7 +13,7 @@ from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import CALIBRATION, load_profile
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 
 DATA_SHEET_ARCSEC = 55.44 * 2**0.5

@@ -21,9 +21,9 @@ from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
 from starhil.hil_tests.private_can_bus import hub_thread
 from starhil.protocol.errors import IcdError, ProtocolError
-from starhil.protocol.icd import load_unit
+from starhil.protocol.files.bundled import bundled
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.names import bundled
+from starhil.protocol.unit import load_unit
 from tests.emulator.runs import CAMERA, Control, FakeImager, FirstHead, command, read
 
 

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Request
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
-from tests.protocol.composed_links import CUBESPACE, CUBESTAR
+from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
 
 pytestmark = pytest.mark.process
 

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from starhil.protocol.messages import Request
-from tests.protocol.composed_links import CUBESPACE
+from tests.protocol.serial.composed_links import CUBESPACE
 
 STEP_S = 30.0
 PEER_BYTES_S = 300_000.0

@@ -28,8 +28,8 @@ from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.canopen.storage import FileStorage
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FORMATS, export
-from starhil.protocol.icd import load_unit
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.serial.stack import SerialStack
+from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from starid.camera.file import load_camera
 from starid.catalog.hipparcos import read_hip2

@@ -25,13 +25,14 @@ from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.truth.feed import LiveFeed, _Datagrams
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.simulator_42 import Format42
-from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame
+from starhil.protocol.can.cubespace import CanDeviceReceiver
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.can.socketcand import format_send
 from starhil.protocol.errors import OneLineError
-from starhil.protocol.flow import TURN
-from starhil.protocol.hub import CanHub, _Client
-from starhil.protocol.icd import load_unit
-from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.socketcand import format_send
+from starhil.protocol.serial.stack import SerialStack
+from starhil.protocol.transports.connections import TURN
+from starhil.protocol.transports.hub import CanHub, _Client
+from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.fuzzing.control import ASKED, REQUESTS, _Loop, _Socket, console_of
 from tests.fuzzing.edits import _spots

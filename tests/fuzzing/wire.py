@@ -17,21 +17,27 @@ from starhil.emulator.truth.simulator_42 import Format42
 from starhil.hil_tests.emulator_process import parse_ready_line
 from starhil.hil_tests.raw_traffic import parse_frame as parse_cansend
 from starhil.hil_tests.raw_traffic import pattern
-from starhil.protocol.can_framing import (
+from starhil.protocol.can.cubespace import (
     CanDeviceReceiver,
-    CanFrame,
     CanHostReceiver,
     encode_reply_frames,
     encode_request_frames,
 )
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.can.socketcand import (
+    CommandSplitter,
+    format_frame,
+    format_send,
+    parse_frame,
+    parse_send,
+)
 from starhil.protocol.canopen.storage import FileStorage
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_unit
+from starhil.protocol.files.bundled import bundled_units
 from starhil.protocol.image_transfer import parse_burst_packet
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.names import bundled_units
-from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
+from starhil.protocol.serial.stack import SerialStack
+from starhil.protocol.unit import load_unit
 from tests.emulator.conftest import Bench
 from tests.fuzzing.target import DOCUMENTED, NESTED, TARGETS, Run, Target, chunks, target
 from tests.protocol.canopen.conftest import Bench as CanopenBench

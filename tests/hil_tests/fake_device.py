@@ -6,14 +6,16 @@ import asyncio
 import threading
 from dataclasses import dataclass, field
 
-from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
-from starhil.protocol.cubespace import Dialect
+from starhil.protocol.can.cubespace import CanDeviceReceiver, encode_reply_frames
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import file_checksum
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.transports import open_can, open_serial
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.serial.stack import SerialStack
+from starhil.protocol.transports.can import open_can
+from starhil.protocol.transports.serial import open_serial
+from starhil.protocol.unit import load_unit
 
 ICD = load_unit()
 EDGE = 64

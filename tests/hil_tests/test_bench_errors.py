@@ -20,9 +20,9 @@ from starhil.hil_tests.interruption import Interrupted, interruptible
 from starhil.hil_tests.raw_traffic import pattern
 from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.hil_tests.truth_log import QUATERNION_COLUMNS, TIME_COLUMN, TruthLogReader
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.icd import load_unit
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import ReplyKind, Request, RequestKind
+from starhil.protocol.unit import load_unit
 
 ICD = load_unit()
 READY = "print('Hello', flush=True); print('ready unit=sagitta serial=/dev/x', flush=True)"

@@ -13,13 +13,16 @@ from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.jitter import unsolicited_jitter
 from starhil.hil_tests.load_figures import CanLoad, SerialLoad, Spread
 from starhil.hil_tests.serial_load import load_serial
-from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.hub import CanHub
-from starhil.protocol.icd import load_unit
+from starhil.protocol.can.cubespace import CanDeviceReceiver, encode_reply_frames
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.transports import CanTransport, SerialTransport, open_can, open_serial
-from tests.protocol.composed_links import CUBESPACE
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.transports.can import CanTransport, open_can
+from starhil.protocol.transports.hub import CanHub
+from starhil.protocol.transports.paced import SerialTransport
+from starhil.protocol.transports.serial import open_serial
+from starhil.protocol.unit import load_unit
+from tests.protocol.serial.composed_links import CUBESPACE
 
 ICD = load_unit()
 RATE = 300.0

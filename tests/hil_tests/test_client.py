@@ -14,14 +14,13 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
 from starhil.hil_tests.images import list_files
 from starhil.hil_tests.raw_traffic import parse_frame, send_and_listen
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.definition import UnknownNameError
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_unit
+from starhil.protocol.icd import FieldError, UnknownNameError
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.transports import open_can
-from starhil.protocol.values import FieldError
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.transports.can import open_can
+from starhil.protocol.unit import load_unit
 from tests.hil_tests.fake_device import EDGE, FakeDevice, bmp_file
 
 PATIENCE_S = 5.0

@@ -14,7 +14,7 @@ import pytest
 from starhil.hil_tests import control
 from starhil.hil_tests.control import ControlClient, Truth
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.conventions import Conventions
+from starhil.protocol.icd.conventions import Conventions
 
 Answer = Callable[[dict], dict | None]
 

@@ -15,8 +15,8 @@ from starhil.hil_tests.expect import (
     measured_attitude,
     show,
 )
-from starhil.protocol.conventions import Conventions
-from starhil.protocol.icd import load_unit
+from starhil.protocol.icd.conventions import Conventions
+from starhil.protocol.unit import load_unit
 
 SENSOR = Conventions()
 

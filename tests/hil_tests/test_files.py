@@ -17,8 +17,7 @@ from starhil.hil_tests.raw_traffic import matches, parse_frame, pattern
 from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, write_junit
 from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.hil_tests.wire_log import WireLog
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.candump import bus_name
+from starhil.protocol.can.frame import CanFrame, bus_name
 from tests.candump import read_candump
 
 

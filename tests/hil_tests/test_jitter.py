@@ -13,11 +13,11 @@ from starhil.hil_tests import jitter
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.jitter import event_timer_jitter, heartbeat_jitter, sync_to_pdo, unsolicited_jitter
 from starhil.hil_tests.load_figures import Jitter
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.hub import CanHub
-from starhil.protocol.icd import load_unit
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import Reply, ReplyKind, Request
-from starhil.protocol.transports import open_can
+from starhil.protocol.transports.can import open_can
+from starhil.protocol.transports.hub import CanHub
+from starhil.protocol.unit import load_unit
 from tests.hil_tests.test_bus_load import DEVICE, HOST, can_device, good
 
 NODE = 44

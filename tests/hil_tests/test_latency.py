@@ -14,8 +14,8 @@ from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.latency import Echo, Viewers, ask_in_turn, exchange, measure
 from starhil.hil_tests.links import CanHostLink, SerialHostLink
 from starhil.hil_tests.private_can_bus import hub_thread
-from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.unit import load_unit
 from tests.hil_tests.fake_device import FakeDevice
 
 ICD = load_unit()

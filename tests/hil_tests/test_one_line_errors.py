@@ -4,7 +4,7 @@ import pytest
 
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.script import load_script
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 
 
 @pytest.mark.parametrize("row", ["quater\\nnion", "quaternion\\u2028"])

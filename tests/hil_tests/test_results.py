@@ -14,7 +14,7 @@ from starhil.hil_tests.conformance.report import write_html_report, write_junit_
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.results import prepare_report, write_junit, write_report
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 
 READY = "import sys, time; print('ready serial=none', flush=True); "
 DIES = READY + "print('Segmentation of the sky', file=sys.stderr); sys.exit(7)"

@@ -12,8 +12,8 @@ from starhil.hil_tests.expect import Variable
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.session_run import find_script
 from starhil.hil_tests.steps import Command, Read, Sample, Send
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import bundled
+from starhil.protocol.files.bundled import bundled
+from starhil.protocol.unit import load_unit
 
 ICD = load_unit()
 

@@ -23,8 +23,8 @@ from starhil.hil_tests.results import junit_cases
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.session import run_steps
 from starhil.hil_tests.session_run import SessionRequest, _emulator, _print_result, run_session
-from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.unit import load_unit
 from starid.errors import StaridError
 from tests.candump import read_candump
 from tests.hil_tests.fake_device import FakeDevice

@@ -11,9 +11,9 @@ from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, ru
 from starhil.hil_tests.errors import BenchError, NackError, ScriptError
 from starhil.hil_tests.script import load_script
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Reply, ReplyKind
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.serial.stack import SerialStack
+from starhil.protocol.unit import load_unit
 from tests.user_units import STREAM, packets, written
 
 DEFINITION = """

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from starhil.protocol.icd import load_unit
-from starhil.protocol.values import MessageError
+from starhil.protocol.icd.values import MessageError
+from starhil.protocol.unit import load_unit
 
 ICD = load_unit()
 MAX_MESSAGE = 512

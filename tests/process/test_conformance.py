@@ -16,7 +16,7 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.protocol.names import find_unit
+from starhil.protocol.files.bundled import find_unit
 from tests.process.test_sessions import starhil
 
 pytestmark = pytest.mark.process

@@ -12,11 +12,11 @@ from typing import Any, Self
 import pytest
 
 from starhil.hil_tests.client import ObcClient
-from starhil.protocol.icd import load_unit
-from starhil.protocol.quoting import cosmos_state
-from tests.protocol.composed_links import CUBESTAR
-from tests.protocol.cosmos_plugin import Plugin
-from tests.protocol.test_export import same
+from starhil.protocol.icd.quoting import cosmos_state
+from starhil.protocol.unit import load_unit
+from tests.protocol.export.cosmos_plugin import Plugin
+from tests.protocol.export.test_export import same
+from tests.protocol.serial.composed_links import CUBESTAR
 
 pytestmark = pytest.mark.process
 

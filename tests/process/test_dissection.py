@@ -10,10 +10,10 @@ import pytest
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from tests.candump import read_candump
 from tests.process.test_sessions import starhil
-from tests.protocol.dissection import dissect
+from tests.protocol.export.dissection import dissect
 
 pytestmark = pytest.mark.process
 

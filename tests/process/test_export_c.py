@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 
 from starhil.hil_tests.client import ObcClient
-from starhil.protocol.cubespace import Dialect
 from starhil.protocol.export import export_folder
 from starhil.protocol.export.packets import key_of
-from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
-from tests.protocol.c_driver import COMPILER, FLAGS, CDriver, c_words, hex_or_none
-from tests.protocol.composed_links import CUBESTAR
-from tests.protocol.test_export_c import KINDS
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.unit import load_unit
+from tests.protocol.export.c_driver import COMPILER, FLAGS, CDriver, c_words, hex_or_none
+from tests.protocol.export.test_c import KINDS
+from tests.protocol.serial.composed_links import CUBESTAR
 
 pytestmark = pytest.mark.process
 

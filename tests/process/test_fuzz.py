@@ -9,7 +9,7 @@ import time
 import pytest
 
 from starhil.hil_tests.client import ObcClient
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from tests.process.reference import (
     ICD,
     UNANSWERED,

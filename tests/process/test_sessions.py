@@ -10,7 +10,7 @@ import pytest
 
 from tests.candump import read_candump
 from tests.emulator.cli.command_line import log_lines, run_command_line
-from tests.protocol.dissection import dissect
+from tests.protocol.export.dissection import dissect
 
 pytestmark = pytest.mark.process
 

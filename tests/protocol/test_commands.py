@@ -11,7 +11,7 @@ from pathlib import Path
 import can
 import pytest
 
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from tests.candump import read_candump
 from tests.emulator.cli.command_line import run_command_line
 

@@ -11,22 +11,28 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from starhil.protocol.can_framing import (
+from starhil.protocol.can.cubespace import (
     MAX_OPEN_MESSAGES,
     CanDeviceReceiver,
-    CanFrame,
     CanHostReceiver,
     CanId,
     encode_reply_frames,
     encode_request_frames,
 )
-from starhil.protocol.cubespace import Dialect
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.can.socketcand import (
+    CommandSplitter,
+    format_frame,
+    format_send,
+    parse_frame,
+    parse_send,
+)
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import parse_burst_packet
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
-from tests.protocol.composed_links import CUBESPACE, stack_of
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.unit import load_unit
+from tests.protocol.serial.composed_links import CUBESPACE, stack_of
 
 INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "100000"))
 SEED = 20260103

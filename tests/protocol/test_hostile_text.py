@@ -18,12 +18,12 @@ import cantools
 import pytest
 from markdown_it import MarkdownIt
 
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FOLDER_FORMATS, FORMATS, export, export_folder
-from starhil.protocol.icd import load_unit
-from starhil.protocol.quoting import c_member
-from tests.protocol.c_driver import COMPILER
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.quoting import c_member
+from starhil.protocol.unit import load_unit
+from tests.protocol.export.c_driver import COMPILER
 
 HOSTILE = (
     "*/ int x; /*", "/*/ */*", "//", "??/", 'a"b', "it's", "back\\slash\\", "\\", "\\\\", "a\nb", "a\n*/\nb", "a\r\nimport os\r\n",

@@ -3,7 +3,7 @@
 import pytest
 
 from starhil.protocol.errors import IcdError
-from starhil.protocol.icd import load_unit, read_definition
+from starhil.protocol.unit import load_unit, read_definition
 
 UNIT = '[unit]\nname = "u"\nversion = "1"\ndoc = "d"\n'
 

@@ -10,12 +10,12 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.c.composed import link_parts
 from starhil.protocol.export.c.rows import RowCode
 from starhil.protocol.export.templates import fill, text_of
-from starhil.protocol.quoting import Scope, c_comment, identifier
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.quoting import Scope, c_comment, identifier
+from starhil.protocol.serial.stack import SerialStack
 
 _FUNCTION: Final = re.compile(r"^static .*?\b(\w+)\(", re.MULTILINE)
 

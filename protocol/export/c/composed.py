@@ -5,13 +5,11 @@ from __future__ import annotations
 import re
 from typing import Any, Final
 
-from starhil.protocol.checks import reversed_bits
-from starhil.protocol.conventions import Order
-from starhil.protocol.envelope import Header
 from starhil.protocol.errors import IcdError
 from starhil.protocol.export.packets import check_one_format, row_key
 from starhil.protocol.export.templates import fill, part_of, text_of
-from starhil.protocol.link_schema import (
+from starhil.protocol.icd.conventions import Order
+from starhil.protocol.icd.link_schema import (
     CrcCheck,
     DelimitedFraming,
     EscapedFraming,
@@ -22,7 +20,9 @@ from starhil.protocol.link_schema import (
     XorCheck,
     XxHashCheck,
 )
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.serial.checks import reversed_bits
+from starhil.protocol.serial.headers import Header
+from starhil.protocol.serial.stack import SerialStack
 
 _MARKS: Final = 8
 """Maximum size of the start and end marks of a message, in bytes, apart from those in a definition."""

@@ -6,13 +6,13 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final
 
-from starhil.protocol.codec import Field, Row, Slot
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning
 from starhil.protocol.export.packets import key_of
 from starhil.protocol.export.templates import fill
-from starhil.protocol.quoting import Scope, c_comment, c_member, c_string, identifier, one_line
-from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, Value, representable
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Field, Row, Slot
+from starhil.protocol.icd.quoting import Scope, c_comment, c_member, c_string, identifier, one_line
+from starhil.protocol.icd.values import INTEGER_RANGES, EnumDefinition, Value, representable
 
 MAP: Final = "map"
 """Name of every enumeration that a field has by its `map`."""

@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Final
 
-from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export import cosmos
 from starhil.protocol.export.cosmos_plugin.composed import link_text
 from starhil.protocol.export.packets import key_bits, key_of
 from starhil.protocol.export.templates import fill, text_of
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.quoting import cosmos_name, cosmos_string, identifier, markdown, ruby_string
 from starhil.protocol.messages import BURST_ID
-from starhil.protocol.quoting import cosmos_name, cosmos_string, identifier, markdown, ruby_string
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.serial.stack import SerialStack
 
 TARGET: Final = "<%= target_name %>"
 """Name of the target, which COSMOS fills in when the plugin is installed."""

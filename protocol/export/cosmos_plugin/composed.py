@@ -7,11 +7,11 @@ from collections.abc import Iterator, Mapping
 from pprint import pformat
 from typing import Any, Final
 
-from starhil.protocol.envelope import Header
 from starhil.protocol.export.packets import CLASS_SHIFT, check_one_format, row_key
 from starhil.protocol.export.templates import part_of, text_of
-from starhil.protocol.link_schema import DelimitedFraming, EscapedFraming, NoCheck, SlipFraming
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.icd.link_schema import DelimitedFraming, EscapedFraming, NoCheck, SlipFraming
+from starhil.protocol.serial.headers import Header
+from starhil.protocol.serial.stack import SerialStack
 
 _NAMES: Final = {"init": "INITIAL", "poly": "POLYNOMIAL", "xor": "XOR_OUT"}
 """Names of the constants for settings of a check; others are the setting in capitals."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.protocol.names import bundled
+from starhil.protocol.files.bundled import bundled
 from tests.emulator.cli.command_line import run_command_line
 
 

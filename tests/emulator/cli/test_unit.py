@@ -18,8 +18,8 @@ from starhil.emulator.run import Run
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import bundled_units, find
+from starhil.protocol.files.bundled import bundled_units, find
+from starhil.protocol.unit import load_unit
 
 
 def unit(*words: str):

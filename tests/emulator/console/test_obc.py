@@ -10,7 +10,7 @@ from starhil.emulator.console.obc import ConsoleObc, Exchange, toml
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.links import CanHostLink, SerialHostLink
 from starhil.hil_tests.script import load_script
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from tests.candump import parse_candump
 from tests.emulator.console.pages import OPTIONS, WITHIN_S, Page
 

@@ -12,7 +12,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.links import CanHostLink, SerialHostLink
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from tests.emulator.conftest import ORION, PREVIEW
 from tests.emulator.runs import Control, command, every_row_read
 

@@ -4,11 +4,12 @@ import pytest
 
 from starhil.emulator.console.trace import DECODED_PER_TURN, WireTrace
 from starhil.emulator.links.traffic import Decoder, Traffic, WireItem, canopen_text
-from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.icd import load_unit
+from starhil.protocol.can.cubespace import encode_reply_frames, encode_request_frames
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from tests.protocol.composed_links import CUBESPACE
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.unit import load_unit
+from tests.protocol.serial.composed_links import CUBESPACE
 
 ICD = load_unit()
 MODE = ICD.telecommands["set_mode"]

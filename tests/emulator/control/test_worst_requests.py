@@ -18,7 +18,7 @@ from starhil.emulator.truth.feed import MAX_LINES, LiveFeed, _Datagrams
 from starhil.emulator.truth.live import LiveTruth
 from starhil.hil_tests.script import ScriptError, load_script
 from starhil.protocol.errors import LONGEST_PROBLEM, MAX_PROBLEMS
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.fuzzing.control import _Loop
 

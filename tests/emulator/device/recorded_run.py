@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth
-from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, Request
+from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.emulator.conftest import Bench
 

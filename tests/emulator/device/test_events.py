@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from starhil.protocol.names import UNITS_FOLDER
+from starhil.protocol.files.bundled import UNITS_FOLDER
 
 EVENTS = ("start", "frame", "mode", "error", "validity")
 

@@ -15,9 +15,9 @@ from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import bundled_units
-from starhil.protocol.values import MessageError
+from starhil.protocol.files.bundled import bundled_units
+from starhil.protocol.icd.values import MessageError
+from starhil.protocol.unit import load_unit
 from starid.errors import StaridError
 from tests.emulator.conftest import ORION
 

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from starhil.emulator.profile import Profile
-from starhil.protocol.names import bundled_units
+from starhil.protocol.files.bundled import bundled_units
 
 HOT = {
     "thermal": {

@@ -7,7 +7,7 @@ import pytest
 from starhil.emulator.device import quantities
 from starhil.emulator.device.device import profile_defaults
 from starhil.emulator.profile import Profile
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 
 HOT = {"thermal": {"heating_c_w": 20.0, "time_constant_s": 5.0}, "parameters": {"update_rate": 0.1}}
 

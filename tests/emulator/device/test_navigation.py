@@ -10,8 +10,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.orbit import KeplerOrbit, OrbitState
 from starhil.emulator.truth.table import OrbitTable, Span
+from starhil.protocol.icd import FieldError
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.values import FieldError
 from starid.catalog.earth import earth_velocity
 
 NEW_YEAR = 1_767_225_600.0

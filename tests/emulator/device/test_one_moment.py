@@ -21,9 +21,9 @@ from starhil.emulator.device.subscriptions import Subscription
 from starhil.emulator.links.canopen import DeviceApplication
 from starhil.emulator.profile import Profile
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.files.bundled import bundled_units
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import FaultKind, LinkFault
-from starhil.protocol.names import bundled_units
 
 TICK_NS = 1000
 

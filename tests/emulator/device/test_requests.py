@@ -6,8 +6,8 @@ from starhil.emulator.device.actions import ACTIONS
 from starhil.emulator.device.counters import Counters
 from starhil.emulator.device.quantities import QUANTITIES
 from starhil.emulator.profile import Profile
-from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, ReplyKind, Request
+from starhil.protocol.unit import load_unit
 
 
 def test_the_device_has_what_its_model_declares():

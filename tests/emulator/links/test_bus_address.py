@@ -11,10 +11,11 @@ from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.symlink_lock import LockError
-from starhil.protocol.can_framing import CanFrame, CanId, MessageType, encode_request_frames
-from starhil.protocol.hub import CanHub
+from starhil.protocol.can.cubespace import CanId, MessageType, encode_request_frames
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import Request
-from starhil.protocol.transports import open_can
+from starhil.protocol.transports.can import open_can
+from starhil.protocol.transports.hub import CanHub
 from tests.emulator.wire import Wire
 
 BUS = "socketcand:127.0.0.1:1/test-of-addresses"

@@ -21,11 +21,11 @@ from starhil.emulator.links.canopen import (
     open_canopen,
     rows_reporting,
 )
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.context import NmtState
 from starhil.protocol.canopen.storage import FileStorage, ParameterStorage
-from starhil.protocol.icd import load_unit
 from starhil.protocol.transports.base import Transport
+from starhil.protocol.unit import load_unit
 
 NODE = 44
 

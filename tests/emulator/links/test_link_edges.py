@@ -12,11 +12,11 @@ from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import JUNK_BYTES, SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.pipeline.messages import ImageRequest, ImageResult
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.storage import ParameterStorage, StorageError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Request
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.serial.stack import SerialStack
 from tests.emulator.wire import Wire
 
 NODE = 44

@@ -12,18 +12,13 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
-from starhil.protocol.can_framing import (
-    CanFrame,
-    CanHostReceiver,
-    CanId,
-    MessageType,
-    encode_request_frames,
-)
-from starhil.protocol.cubespace import Dialect
+from starhil.protocol.can.cubespace import CanHostReceiver, CanId, MessageType, encode_request_frames
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.serial.cubespace import Dialect
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
-from tests.protocol.composed_links import CUBESPACE, CUBESTAR
+from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
 
 SEED = 20260101
 JUNK = 10_000

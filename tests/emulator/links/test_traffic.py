@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import pytest
 
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS, MAX_ADDRESSES, Decoder, Traffic, WireItem, short
-from starhil.protocol.can_framing import CanFrame, encode_reply_frames
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.icd import load_unit
+from starhil.protocol.can.cubespace import encode_reply_frames
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
-from tests.protocol.composed_links import CUBESPACE
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.unit import load_unit
+from tests.protocol.serial.composed_links import CUBESPACE
 
 ICD = load_unit()
 MODE = ICD.telecommands["set_mode"]

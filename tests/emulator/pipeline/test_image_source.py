@@ -24,7 +24,7 @@ from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.camera.file import save_camera

@@ -12,7 +12,7 @@ from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.truth.source import RateTruth
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from tests.emulator.conftest import Bench
 from tests.emulator.wire import Wire
 

@@ -11,8 +11,8 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import NackError
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import UNITS_FOLDER
+from starhil.protocol.files.bundled import UNITS_FOLDER
+from starhil.protocol.unit import load_unit
 from tests.emulator.units.clients import Emulated, arcseconds_between, true_matrix, with_unit
 from tests.protocol.canopen.conftest import import_eds
 

@@ -9,8 +9,8 @@ import struct
 
 import pytest
 
-from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Request
+from starhil.protocol.unit import load_unit
 from tests.emulator.conftest import Bench
 
 

@@ -31,9 +31,9 @@ from starhil.hil_tests.endurance.life import UNRECORDED, Life, Outcome, make_lif
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.violating_life import kind_of, shortened
 from starhil.hil_tests.judge.definition import unit_of
-from starhil.protocol.codec import Row
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import bundled_units
+from starhil.protocol.files.bundled import bundled_units
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
 
 LIVES, STEPS = 4, 150

@@ -18,7 +18,7 @@ from starhil.hil_tests.endurance.run import ORION
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import read_unit
 from starhil.hil_tests.judge.rows import PARAMETER
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 
 UNIT = read_unit("cubestar")
 IDENTIFICATION, VERSION = UNIT.telemetry["identification"], UNIT.telemetry["boot_status"]

@@ -11,8 +11,8 @@ from starhil.hil_tests.judge import can
 from starhil.hil_tests.judge.definition import read_unit
 from starhil.hil_tests.judge.messages import Answer
 from starhil.hil_tests.judge.serial import SerialLine
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.names import bundled_units
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.files.bundled import bundled_units
 
 CUBESTAR = read_unit("cubestar")
 PACKET = bytes(range(22))

@@ -14,13 +14,13 @@ from starhil.hil_tests.judge.can import frames_of, read_answer
 from starhil.hil_tests.judge.definition import Unit, read_unit
 from starhil.hil_tests.judge.messages import Answer
 from starhil.hil_tests.judge.serial import SerialLine
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.cubespace import Dialect
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.icd import load_unit
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.files.bundled import bundled_units
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
-from starhil.protocol.names import bundled_units
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.serial.stack import SerialStack
+from starhil.protocol.unit import load_unit
 from tests.conformance.links import LINKS, write_unit
 
 

@@ -18,12 +18,12 @@ from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.case import CaseFailed
 from starhil.hil_tests.conformance.runner import run_case
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.application import GreyImage
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import ParameterStorage
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from tests.protocol.canopen.stand_in import StandInApplication
 
 NODE = 0x2C

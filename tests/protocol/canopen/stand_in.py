@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import starhil.protocol.canopen
 from starhil.protocol.canopen.application import GreyImage
-from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.values import Value
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.values import Value
 
 
 class StandInApplication:

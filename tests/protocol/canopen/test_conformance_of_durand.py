@@ -11,7 +11,7 @@ from durand.node import MinimalNode
 from durand.object_dictionary import Record, Variable
 from durand.scheduler import VirtualScheduler, get_scheduler, set_scheduler
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 
 NODE = 0x2C
 

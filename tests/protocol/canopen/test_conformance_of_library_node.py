@@ -7,10 +7,10 @@ from collections import deque
 import canopen
 import pytest
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 
 NODE = 0x2C
 

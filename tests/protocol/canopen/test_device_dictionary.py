@@ -10,11 +10,11 @@ import pytest
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import check_status
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
-from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.errors import IcdError
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import find_unit
-from starhil.protocol.unit_examples import examine
+from starhil.protocol.files.bundled import find_unit
+from starhil.protocol.icd.canopen_schema import CanopenModel
+from starhil.protocol.unit import load_unit
+from starhil.protocol.unit.examples import examine
 
 ICD = load_unit()
 

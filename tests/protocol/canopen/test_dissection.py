@@ -6,7 +6,7 @@ import pytest
 
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.runner import run_case
-from tests.protocol.dissection import dissect
+from tests.protocol.export.dissection import dissect
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from canopen.objectdictionary import ODVariable, datatypes
 
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 
 
 @pytest.fixture(scope="module")

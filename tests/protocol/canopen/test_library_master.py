@@ -11,7 +11,7 @@ import can
 import canopen
 import pytest
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.eds import build_eds
 
 FRAME = bytes(number * 7 & 0xFF for number in range(937 * 937))

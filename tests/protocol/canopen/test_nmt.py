@@ -8,7 +8,7 @@ from starhil.protocol.canopen.context import NmtState
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 
 HEARTBEAT_LOST = bytes.fromhex("3081 11")
 

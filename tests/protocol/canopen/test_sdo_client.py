@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import download, requests_of, row_transfer
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.errors import IcdError
-from starhil.protocol.icd import load_unit
+from starhil.protocol.unit import load_unit
 from tests.protocol.canopen.stand_in import StandInApplication
 
 NODE = 0x2C

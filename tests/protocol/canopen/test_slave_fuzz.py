@@ -6,9 +6,9 @@ import random
 
 import pytest
 
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.icd import load_unit
-from starhil.protocol.names import bundled_units
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.files.bundled import bundled_units
+from starhil.protocol.unit import load_unit
 from tests.protocol.canopen.conftest import NODE, Bench
 from tests.protocol.test_fuzz import INPUTS, SEED
 

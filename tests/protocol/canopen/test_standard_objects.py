@@ -10,9 +10,9 @@ import pytest
 from starhil.protocol.canopen.abort import AbortCode
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
-from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.errors import IcdError
-from starhil.protocol.icd import load_unit
+from starhil.protocol.icd.canopen_schema import CanopenModel
+from starhil.protocol.unit import load_unit
 
 EMCY = 0xAC
 

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.hub import CanHub
-from starhil.protocol.transports import CanTransport, SerialTransport, open_can, open_serial
-from starhil.protocol.transports.can import kernel_can_is_up
+from starhil.protocol.transports.can import CanTransport, kernel_can_is_up, open_can
+from starhil.protocol.transports.hub import CanHub
+from starhil.protocol.transports.paced import SerialTransport
+from starhil.protocol.transports.serial import open_serial
 
 DEADLINE_S = 10.0
 HAS_VCAN = kernel_can_is_up("vcan0")

@@ -11,9 +11,10 @@ import time
 import can
 import pytest
 
-from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.transports import TransportError, open_can
+from starhil.protocol.transports.base import TransportError
+from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.python_can import QUEUE_LIMIT, PythonCanTransport
 from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, can_pair, until
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import can
 import pytest
 
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.hub import DEFAULT_HOST, CanHub
-from starhil.protocol.transports import TransportError, open_can
-from starhil.protocol.transports.can import new_hub
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.transports.base import TransportError
+from starhil.protocol.transports.can import new_hub, open_can
+from starhil.protocol.transports.hub import DEFAULT_HOST, CanHub
 from starhil.protocol.transports.hub_client import BACKLOG_LIMIT as HUB_BACKLOG
 from starhil.protocol.transports.hub_client import AutoHubTransport
 from tests.protocol.transports.pairs import FRAMES, CanPair, until

@@ -12,10 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.hub import CanHub
-from starhil.protocol.transports import SerialTransport, open_can, open_serial
+from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.transports.base import Transport
+from starhil.protocol.transports.can import open_can
+from starhil.protocol.transports.hub import CanHub
+from starhil.protocol.transports.paced import SerialTransport
+from starhil.protocol.transports.serial import open_serial
 from tests.protocol.transports.pairs import FRAMES, until
 
 SLOW_BAUD = 9600

@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from starhil.protocol.transports import SerialTransport, open_serial, pty
+from starhil.protocol.transports import pty
+from starhil.protocol.transports.paced import SerialTransport
+from starhil.protocol.transports.serial import open_serial
 from tests.protocol.transports.pairs import until
 
 MESSAGE = bytes(range(100))

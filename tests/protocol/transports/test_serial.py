@@ -14,8 +14,9 @@ import pytest
 import serial
 
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.transports import TransportError, open_serial
+from starhil.protocol.transports.base import TransportError
 from starhil.protocol.transports.paced import BACKLOG_LIMIT, PacedTransport
+from starhil.protocol.transports.serial import open_serial
 from tests.conformance.simulated import SimulatedLoop
 from tests.protocol.transports.pairs import DEADLINE_S, SERIAL_KINDS, serial_pair, until
 

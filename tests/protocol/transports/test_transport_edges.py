@@ -4,7 +4,8 @@ import asyncio
 
 import pytest
 
-from starhil.protocol.transports import TransportError, open_can
+from starhil.protocol.transports.base import TransportError
+from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.serial import open_serial
 from tests.protocol.transports.pairs import until
 

@@ -1,0 +1,1 @@
+"""CAN frames, and messages in them."""

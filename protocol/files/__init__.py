@@ -1,0 +1,1 @@
+"""Files that users name: found, read within limits, validated, replaced safely."""

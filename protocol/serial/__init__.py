@@ -1,0 +1,1 @@
+"""A serial link: framing, header, check, and the stack that puts them together."""

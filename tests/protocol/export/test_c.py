@@ -1,0 +1,283 @@
+"""The exported C, compiled with all warnings as errors and run under the sanitizers, against our codec and link."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from starhil.protocol.can.cubespace import CanHostReceiver, encode_reply_frames, encode_request_frames
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import FieldError
+from starhil.protocol.icd.codec import Row
+from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.unit import load_unit
+from tests.emulator.units.clients import Emulated, with_unit
+from tests.protocol.export.c_driver import CDriver, c_words, hex_or_none
+from tests.protocol.export.test_export import by_name, packets
+from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
+from tests.test_your_unit import written
+
+ICD = load_unit()
+ROWS = [row for row in ICD.rows if row.named_fields]
+KINDS = ["none", "telemetry", "ack", "nack", "unsolicited", "event", "burst", "fault"]
+FAULT = str(KINDS.index("fault"))
+
+
+@pytest.fixture(scope="module")
+def c(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CDriver]:
+    with CDriver(ICD, tmp_path_factory.mktemp("c")) as driver:
+        yield driver
+
+
+@pytest.mark.parametrize("row", ROWS, ids=by_name)
+def test_a_row_has_the_same_bytes_and_values_both_ways(c: CDriver, row: Row) -> None:
+    for values, data in packets(row):
+        words = c_words(row, row.decode(data))
+        assert c("decode", row.name, data.hex()) == ["0", *words]
+        assert c("encode", row.name, *c_words(row, values)) == ["0", data.hex()]
+
+
+def refused_at(row: Row, data: bytes) -> int:
+    """Position of the value of a telecommand that our codec refuses, from 1; 0 if it takes all."""
+    try:
+        row.decode(data)
+    except FieldError as error:
+        return error.index + 1
+    return 0
+
+
+@pytest.mark.parametrize("row", ROWS, ids=by_name)
+def test_random_bytes_of_a_row_are_read_and_refused_alike(c: CDriver, row: Row) -> None:
+    rng = random.Random(row.id)
+    for _ in range(20):
+        data = rng.randbytes(row.size)
+        if any(field.kind == "text" for field in row.fields):
+            data = bytes(byte % 128 or 32 for byte in data)
+        result, *words = c("decode", row.name, data.hex())
+        words = ["nan" if word == "-nan" else word for word in words]
+        assert words == c_words(row, row.decode(data, check=False))
+        assert int(result) == refused_at(row, data)
+    for size in (row.size - 1, row.size + 1):
+        assert c("decode", row.name, hex_or_none(bytes(size))) == ["-1"]
+
+
+@pytest.mark.parametrize("row", ROWS, ids=by_name)
+def test_a_value_beyond_its_limits_is_refused_by_its_position(c: CDriver, row: Row) -> None:
+    words = c_words(row, row.example())
+    for index, field in enumerate(row.named_fields.values(), 1):
+        if field.kind not in ("integer", "bits", "float") or not (
+            field.scaled or field.minimum or field.maximum
+        ):
+            continue
+        low, high = field.physical_limits
+        for bad in (low - max(abs(low), 1.0), high + max(abs(high), 1.0)):
+            if field.scaled or field.kind == "float":
+                text = f"{bad:.17g}"
+            elif (bad < 0 and not field.type.startswith("i")) or abs(bad) >= 2 ** (8 * field.size - 1):
+                continue  # the member cannot hold it
+            else:
+                text = str(int(bad))
+            beyond = (field.minimum is not None and bad < low) or (field.maximum is not None and bad > high)
+            if field.kind != "float" or beyond:
+                given = [*words[: index - 1], text, *words[index:]]
+                assert c("encode", row.name, *given) == [str(index)], field.name
+
+
+@pytest.mark.parametrize("row", list(ICD.rows), ids=by_name)
+def test_requests_are_framed_as_ours(c: CDriver, row: Row) -> None:
+    samples = [data for _, data in packets(row)] if row.kind == "telecommand" else [b""]
+    for data in [*samples, b"\x1f" * row.size]:
+        framed = CUBESPACE.encode_request(Request.of(row.id, data))
+        assert c("frame", row.id, hex_or_none(data)) == ["0", framed.hex()]
+
+
+def events(dialect: Dialect, pending: int | None, data: bytes) -> list[str]:
+    """What our receiver of the OBC's side makes of bytes, as the program prints it."""
+    receiver = CUBESTAR.host(dialect)
+    if pending is not None:
+        receiver.expect(Request.of(pending))
+    words: list[str] = []
+    for event in receiver.feed(data, 0.0):
+        if isinstance(event, LinkFault):
+            words += [FAULT, "0", "0", "-"]
+        else:
+            words += [
+                str(KINDS.index(event.kind.value)),
+                str(event.id),
+                str(int(event.code)),
+                hex_or_none(event.data),
+            ]
+    return [*words, FAULT if receiver.flush(1.0) else "0"]
+
+
+def c_events(c: CDriver, dialect: Dialect, pending: int | None, data: bytes) -> list[str]:
+    return c("receive", list(Dialect).index(dialect), -1 if pending is None else pending, hex_or_none(data))
+
+
+@pytest.mark.parametrize("dialect", Dialect)
+def test_the_receiver_of_the_c_reads_streams_as_ours(c: CDriver, dialect: Dialect) -> None:
+    rng = random.Random(7)
+    rows = list(ICD.rows)
+    for _ in range(400):
+        pending = rng.choice([None, 230, 60, 200, *(row.id for row in rows)])
+        stream = b""
+        for _ in range(rng.randrange(4)):
+            row = rng.choice(rows)
+            kind = rng.choice([kind for kind in ReplyKind if kind is not ReplyKind.ECHO])
+            reply = Reply(
+                kind,
+                119 if kind is ReplyKind.BURST else rng.choice([row.id, pending or 1]),
+                rng.randbytes(22 if kind is ReplyKind.BURST else rng.choice([row.size or 1, 1, 23]))
+                if kind not in (ReplyKind.ACK, ReplyKind.NACK)
+                else b"",
+                code=rng.randrange(1, 11) if kind is ReplyKind.NACK else 0,
+            )
+            try:
+                stream += CUBESPACE.encode_reply(reply, dialect)
+            except ProtocolError:
+                continue
+        damaged = bytearray(stream + rng.randbytes(rng.randrange(3)))
+        for _ in range(rng.randrange(4)):
+            if damaged:
+                damaged[rng.randrange(len(damaged))] = rng.choice(b"\x1f\x7f\xff\x07\x0f\x2f\x4f\x00\x77")
+        for data in (stream, bytes(damaged)):
+            assert c_events(c, dialect, pending, data) == events(dialect, pending, data), data.hex()
+
+
+def test_a_message_that_is_too_long_is_one_fault(c: CDriver) -> None:
+    data = b"\x1f\x7f\x80" + bytes(600) + b"\x1f\xff"
+    assert c_events(c, Dialect.A, 128, data) == events(Dialect.A, 128, data)
+
+
+# -- CAN ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("row", list(ICD.rows), ids=by_name)
+def test_requests_on_can_are_framed_as_ours(c: CDriver, row: Row) -> None:
+    samples = [bytes(range(row.size))] if row.kind == "telecommand" else [b""]
+    for data in samples:
+        frames = encode_request_frames(Request.of(row.id, data), 1, 4)
+        expected = [word for frame in frames for word in (str(frame.id), hex_or_none(frame.data))]
+        assert c("can_frame", row.id, hex_or_none(data)) == expected
+
+
+def test_a_request_on_can_has_as_many_frames_as_its_counter_allows(c: CDriver) -> None:
+    for size in (0, 7, 8, 9, 14, 15, 1792):
+        data = bytes(number % 251 for number in range(size))
+        frames = encode_request_frames(Request.of(9, data), 1, 4)
+        assert c("can_frame", 9, hex_or_none(data))[1::2] == [hex_or_none(frame.data) for frame in frames]
+    assert c("can_frame", 9, bytes(1793).hex()) == []
+
+
+def can_events(frames: list[CanFrame]) -> list[list[str]]:
+    """What our receiver of the OBC's side makes of each frame, as the program prints it, and of the silence after them."""
+    receiver = CanHostReceiver(1, 4)
+    found = []
+    for frame in frames:
+        events = receiver.feed(frame, 0.0)
+        messages = [event for event in events if not isinstance(event, LinkFault)]
+        words = [FAULT, "0", "0", "-"] if events else []
+        for event in messages:
+            words = [KINDS.index(event.kind.value), event.id, int(event.code), hex_or_none(event.data)]
+        found.append([str(word) for word in words])
+    return [*found, [FAULT] if receiver.flush(1.0) else ["0"]]
+
+
+def test_the_receiver_of_the_c_reads_can_as_ours(c: CDriver) -> None:
+    rng = random.Random(11)
+    for _ in range(300):
+        frames: list[CanFrame] = []
+        for _ in range(rng.randrange(1, 5)):
+            kind = rng.choice([kind for kind in ReplyKind if kind is not ReplyKind.ECHO])
+            short = kind in (ReplyKind.ACK, ReplyKind.NACK)
+            data = rng.randbytes(
+                0 if short else rng.choice([1, 8] if kind is ReplyKind.EVENT else [1, 8, 9, 22, 70])
+            )
+            id_ = 119 if kind is ReplyKind.BURST else 128 if kind is ReplyKind.TELEMETRY else 130
+            code = rng.randrange(1, 11) if kind is ReplyKind.NACK else 0
+            frames += encode_reply_frames(Reply(kind, id_, data, code=code, destination=1), 4)
+        damaged = list(frames)
+        for _ in range(rng.randrange(4)):
+            at = rng.randrange(len(damaged))
+            odd = rng.choice([damaged[at].data[:-1], b"", rng.randbytes(8)])
+            damaged[at : at + 1] = rng.choice(
+                [
+                    [],
+                    [damaged[at]] * 2,
+                    [replace(damaged[at], data=odd)],
+                    [replace(damaged[at], id=damaged[at].id ^ 0x100)],
+                ]
+            ) or [CanFrame(0x1F010401)]
+        for sent in (frames, damaged):
+            c("can_receive", 0)
+            got = [c("can", frame.id, hex_or_none(frame.data)) for frame in sent]
+            assert [*got, c("can_give_up", 0)] == can_events(sent), sent
+
+
+def test_another_row_ends_an_incomplete_message_on_can(c: CDriver) -> None:
+    cut, whole = (
+        encode_reply_frames(Reply(ReplyKind.TELEMETRY, id_, bytes(size), destination=1), 4)
+        for id_, size in ((130, 20), (131, 13))
+    )
+    c("can_receive", 0)
+    got = [c("can", frame.id, hex_or_none(frame.data)) for frame in (cut[0], *whole)]
+    assert got == [[], [FAULT, "0", "0", "-"], ["1", "131", "0", bytes(13).hex()]]
+    assert c("can_give_up", 0) == ["0"]
+
+
+def test_a_message_on_can_that_is_too_long_is_one_fault(c: CDriver) -> None:
+    frames = encode_reply_frames(Reply(ReplyKind.TELEMETRY, 130, bytes(600), destination=1), 4)
+    c("can_receive", 0)
+    got = [c("can", frame.id, hex_or_none(frame.data)) for frame in frames]
+    assert [*got, c("can_give_up", 0)] == can_events(frames)
+    assert sum(FAULT in words for words in got) == 1
+
+
+def test_every_row_is_answered_by_the_emulated_unit_on_can(c: CDriver) -> None:
+    def ask(unit: Emulated, row: Row, data: bytes) -> list[str]:
+        c("can_receive", 0)
+        words = c("can_frame", row.id, hex_or_none(data))
+        answer: list[CanFrame] = []
+        for can_id, hexed in zip(words[::2], words[1::2], strict=True):
+            answer += unit.ask_can(int(can_id), bytes.fromhex(hexed.strip("-")))
+        *none, last = [c("can", frame.id, hex_or_none(frame.data)) for frame in answer]
+        assert none == [[]] * len(none)
+        return last
+
+    def scenario(unit: Emulated) -> None:
+        for row in ICD.telemetry.values():
+            kind, id_, _, data = ask(unit, row, b"")
+            assert (KINDS[int(kind)], int(id_), len(data) // 2) == ("telemetry", row.id, row.size), row.name
+        for row in ICD.telecommands.values():
+            kind, id_, *_ = ask(unit, row, row.encode(row.example()))
+            assert (KINDS[int(kind)] in ("ack", "nack"), int(id_)) == (True, row.id), row.name
+
+    with_unit("cubestar", "can", scenario)
+
+
+# -- other units -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["sagitta", "nos3", "st16", "cubestar-gen2", "tutorial"])
+def test_the_rows_of_a_unit_have_the_same_bytes_and_values_both_ways(name: str, tmp_path: Path) -> None:
+    icd = load_unit(written(tmp_path / "lynx") if name == "tutorial" else name)
+    rng = random.Random(name)
+    with CDriver(icd, tmp_path) as driver:
+        for row in (row for row in icd.rows if row.named_fields):
+            for values, data in packets(row):
+                assert driver("decode", row.name, data.hex()) == ["0", *c_words(row, row.decode(data))]
+                assert driver("encode", row.name, *c_words(row, values)) == ["0", data.hex()], row.name
+            if any(field.kind in ("float", "text") for field in row.fields):
+                continue
+            data = rng.randbytes(row.size)
+            result, *words = driver("decode", row.name, data.hex())
+            assert (int(result), words) == (
+                refused_at(row, data),
+                c_words(row, row.decode(data, check=False)),
+            )

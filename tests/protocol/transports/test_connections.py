@@ -1,0 +1,164 @@
+"""Queues whose senders take turns, and a CAN hub on which a flood delays and loses its own frames only."""
+
+from __future__ import annotations
+
+import asyncio
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.can.socketcand import format_send
+from starhil.protocol.transports.can import open_can
+from starhil.protocol.transports.connections import WINDOW, FairQueue
+from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub
+from tests.protocol.transports.pairs import until
+
+FLOOD = CanFrame(0x123, bytes(8), extended=False)
+REQUEST = CanFrame(0x200, b"\x01", extended=False)
+REPLY = CanFrame(0x201, b"\x02", extended=False)
+
+
+def test_senders_take_turns_and_each_keeps_its_order() -> None:
+    queue = FairQueue(100)
+    assert queue.put("flood", [b"f1", b"f2", b"f3", b"f4"]) == 0
+    assert queue.put("other", [b"o1", b"o2"]) == 0
+    assert queue.take(4) == [b"f1", b"o1"]
+    assert queue.take(100) == [b"f2", b"o2", b"f3", b"f4"]
+    assert queue.take(100) == []
+    assert queue.size == 0
+
+
+def test_the_sender_that_has_most_waiting_loses_its_oldest() -> None:
+    queue = FairQueue(8)
+    assert queue.put("flood", [b"f1", b"f2", b"f3", b"f4"]) == 0
+    assert queue.put("other", [b"o1", b"o2"]) == 2
+    assert queue.take(100) == [b"f3", b"o1", b"f4", b"o2"]
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 3), st.lists(st.binary(min_size=1, max_size=9), max_size=5), st.integers(0, 20)
+        )
+    )
+)
+def test_every_item_is_delivered_or_counted_as_dropped(steps: list[tuple[int, list[bytes], int]]) -> None:
+    queue, put, taken, dropped = FairQueue(30), 0, 0, 0
+    for sender, lines, size in steps:
+        put += len(lines)
+        dropped += queue.put(sender, lines)
+        assert queue.size <= 30
+        taken += len(queue.take(size))
+    taken += len(queue.take(31))
+    assert (put, queue.size) == (taken + dropped, 0)
+
+
+async def join(hub: CanHub) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+    """A client in raw mode that sends raw text and reads only on request."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", hub.port)
+    await reader.readuntil(b">")
+    for command in (b"< open vcan0 >", b"< remote >", b"< rawmode >"):
+        writer.write(command)
+        await reader.readuntil(b">")
+    return reader, writer
+
+
+def test_a_flood_takes_the_place_of_no_other_clients_frame() -> None:
+    async def main() -> None:
+        hub = CanHub(port=0)
+        await hub.start()
+        reader, writer = await join(hub)
+        reader._transport.pause_reading()  # type: ignore[attr-defined]
+        (_, flood), (_, other) = await join(hub), await join(hub)
+        while not hub.statistics.dropped:
+            flood.write(format_send(FLOOD) * 1000)
+            await flood.drain()
+            await asyncio.sleep(0)
+        other.write(format_send(REQUEST))
+        before = hub.statistics.frames
+        await until(lambda: hub.statistics.frames > before)
+        await asyncio.sleep(0.05)
+        reader._transport.resume_reading()  # type: ignore[attr-defined]
+        async with asyncio.timeout(10):
+            while b" 200 " not in await reader.readuntil(b">"):
+                pass
+        writer.close()
+        await hub.close()
+
+    asyncio.run(main())
+
+
+def test_a_request_is_answered_before_most_of_a_flood_that_came_first() -> None:
+    """The flooding client never reads; whoever answers works off what has reached it, not all that waits."""
+
+    async def main() -> None:
+        hub = CanHub(port=0)
+        await hub.start()
+        spec = f"socketcand:127.0.0.1:{hub.port}/vcan0"
+        device, bench = open_can(spec), open_can(spec)
+        handled = 0
+        handled_at: list[int] = []
+
+        def handle(frame: CanFrame) -> None:
+            nonlocal handled
+            handled += 1
+            if frame == REQUEST:
+                handled_at.append(handled)
+                device.send(REPLY)
+            else:
+                for _ in range(3):
+                    device.send(FLOOD)
+
+        heard: list[CanFrame] = []
+        await device.start(handle)
+        await bench.start(lambda frame: heard.append(frame) if frame.id == REPLY.id else None)
+        device._writer.transport.pause_reading()  # type: ignore[attr-defined]
+        _, flood = await join(hub)
+        while not hub.statistics.dropped:
+            flood.write(format_send(FLOOD) * 1000)
+            await flood.drain()
+            await asyncio.sleep(0)
+        bench.send(REQUEST)
+        await bench.drain()
+        await asyncio.sleep(0.05)
+        device._writer.transport.resume_reading()  # type: ignore[attr-defined]
+        async with asyncio.timeout(60):
+            while not heard:
+                await asyncio.sleep(3.0)  # on a busy machine the device's own flood can push its reply out
+                bench.send(REQUEST)
+        text = len("< frame 123 1700000000.250000 0000000000000000 >")
+        assert handled_at[0] * text < BACKLOG_LIMIT
+        for transport in (bench, device):
+            await transport.close()
+        await hub.close()
+
+    asyncio.run(main())
+
+
+def test_a_client_stops_reading_while_the_hub_does_not_accept_its_frames() -> None:
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(b"< hi >")
+        for _ in range(3):
+            await reader.readuntil(b">")
+            writer.write(b"< ok >")
+        reader._transport.pause_reading()  # type: ignore[attr-defined]
+        while True:
+            writer.write(b"< frame 123 1.000000 00 >" * 1000)
+            await writer.drain()
+
+    async def main() -> None:
+        server = await asyncio.start_server(serve, "127.0.0.1", 0)
+        device = open_can(f"socketcand:127.0.0.1:{server.sockets[0].getsockname()[1]}/vcan0")
+        await device.start(lambda _: [device.send(FLOOD) for _ in range(10)])
+        received = -1
+        async with asyncio.timeout(10):
+            while device.statistics.received != received:
+                received = device.statistics.received
+                await asyncio.sleep(0.2)
+        assert device._writer.transport.get_write_buffer_size() < 10 * WINDOW  # type: ignore[attr-defined]
+        await device.close()
+        server.close()
+
+    asyncio.run(main())
