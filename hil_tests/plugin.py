@@ -25,8 +25,8 @@ import pytest
 
 if TYPE_CHECKING:
     from starhil.hil_tests.client import ObcClient
-    from starhil.hil_tests.control import ControlClient, Truth
-    from starhil.hil_tests.emulator_process import EmulatorProcess
+    from starhil.hil_tests.rig.control import ControlClient, Truth
+    from starhil.hil_tests.rig.emulator_process import EmulatorProcess
     from starhil.protocol.files.bundled import Kind
 
 
@@ -96,9 +96,9 @@ class _Emulators:
 
     def get(self, profile: str | None, settings: tuple[str, ...]) -> EmulatorProcess:
         """Return an emulator after power-on: the running one, reset, or a new one."""
-        from starhil.hil_tests.control import ControlClient
-        from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-        from starhil.hil_tests.private_can_bus import private_can_bus
+        from starhil.hil_tests.rig.control import ControlClient
+        from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+        from starhil.hil_tests.rig.private_can_bus import private_can_bus
 
         if self._running is not None and self._wanted == (profile, settings):
             with ControlClient(self._running.ready["control"]) as control:
@@ -205,7 +205,7 @@ def starhil_can(request: pytest.FixtureRequest) -> Iterator[ObcClient]:
 @pytest.fixture
 def starhil_control(starhil_emulator: EmulatorProcess) -> Iterator[ControlClient]:
     """Return a client of the emulator's control channel: `do(action, **keys)`."""
-    from starhil.hil_tests.control import ControlClient
+    from starhil.hil_tests.rig.control import ControlClient
 
     with ControlClient(starhil_emulator.ready["control"]) as control:
         yield control
@@ -214,7 +214,7 @@ def starhil_control(starhil_emulator: EmulatorProcess) -> Iterator[ControlClient
 @pytest.fixture
 def starhil_truth(starhil_control: ControlClient, starhil_emulator: EmulatorProcess) -> Truth:
     """Return the truth of the emulator: `point`, `set`, `attitude` and `error`."""
-    from starhil.hil_tests.control import Truth
+    from starhil.hil_tests.rig.control import Truth
     from starhil.protocol.files.bundled import DEFAULT_UNIT
     from starhil.protocol.unit import load_unit
 

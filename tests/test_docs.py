@@ -30,9 +30,9 @@ from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.csv_file import BOUNDS
 from starhil.emulator.truth.source import TruthStatus
 from starhil.emulator.truth_log import COLUMNS
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.private_can_bus import hub_thread, private_can_bus
-from starhil.hil_tests.raw_traffic import parse_frame
+from starhil.hil_tests.client.raw_traffic import parse_frame
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.private_can_bus import hub_thread, private_can_bus
 from starhil.protocol.can.cubespace import MessageType
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary

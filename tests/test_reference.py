@@ -13,9 +13,9 @@ import pytest
 
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.profile import load_profile
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import ScriptError
-from starhil.hil_tests.script import load_script
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.session.script import load_script
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
 

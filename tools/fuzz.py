@@ -36,9 +36,9 @@ SLOWEST_S = 20
 MEMORY_MB = 3000
 CORPUS_BYTES = 3000
 INSTRUMENTED = (
-    "starhil.protocol", "starhil.hil_tests.script", "starhil.hil_tests.steps", "starhil.hil_tests.expect",
-    "starhil.hil_tests.images", "starhil.hil_tests.raw_traffic", "starhil.hil_tests.truth_log",
-    "starhil.hil_tests.emulator_process", "starhil.emulator.control", "starhil.emulator.console",
+    "starhil.protocol", "starhil.hil_tests.session.script", "starhil.hil_tests.session.steps", "starhil.hil_tests.session.expect",
+    "starhil.hil_tests.client.images", "starhil.hil_tests.client.raw_traffic", "starhil.hil_tests.rig.truth_log",
+    "starhil.hil_tests.rig.emulator_process", "starhil.emulator.control", "starhil.emulator.console",
     "starhil.emulator.device", "starhil.emulator.truth", "starhil.emulator.profile",
     "starhil.emulator.replay", "starhil.emulator.replay_differences", "starhil.emulator.cli.endurance", "starhil.emulator.tape",
     "starhil.emulator.json_lines", "starhil.emulator.toml_file", "starid.storage.files",

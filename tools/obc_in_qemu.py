@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.protocol.export import export_folder
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude

@@ -42,13 +42,13 @@ from urllib.parse import urlsplit
 
 from aiohttp import ClientSession, ClientWebSocketResponse
 
-from starhil.hil_tests.bench import LinkOptions
 from starhil.hil_tests.client import ObcClient
-from starhil.hil_tests.control import ControlClient
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError, DeviceError
-from starhil.hil_tests.load_figures import percentile
-from starhil.hil_tests.session_run import SessionRequest, run_session
+from starhil.hil_tests.rig.bench import LinkOptions
+from starhil.hil_tests.rig.control import ControlClient
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, hub_command
+from starhil.hil_tests.session import SessionRequest, run_session
+from starhil.hil_tests.timing.figures import percentile
 
 WARM_UP_SHARE = 0.25
 MEMORY_GROWTH_MB = 8.0

@@ -66,7 +66,7 @@ def latency(
     as_json: AsJson = False,
 ) -> None:
     """Measure reply latency on both links while images are solved, and the emulator's start-up time."""
-    from starhil.hil_tests.latency import measure
+    from starhil.hil_tests.timing.latency import measure
 
     chosen = [one_of("--worker", worker, ("process", "thread")) for worker in workers or ["process"]]
     report = progress()
@@ -223,7 +223,7 @@ def bus(
     from contextlib import nullcontext
 
     from starhil.emulator.cli.bench_bus import check_rows, measure, print_figures, started_device
-    from starhil.hil_tests.realtime import set_realtime_priority
+    from starhil.hil_tests.timing.realtime import set_realtime_priority
     from starhil.protocol.unit import load_unit
 
     running = device.target()

@@ -10,15 +10,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from starhil.hil_tests.bus_load import DEVICE, load_can
 from starhil.hil_tests.client import ObcClient
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.jitter import event_timer_jitter, heartbeat_jitter, sync_to_pdo, unsolicited_jitter
-from starhil.hil_tests.latency import REQUESTED_ROWS
-from starhil.hil_tests.load_figures import CanLoad, Jitter, SerialLoad
-from starhil.hil_tests.realtime import set_realtime_priority
-from starhil.hil_tests.serial_load import load_serial
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, hub_command
+from starhil.hil_tests.timing.can_load import DEVICE, load_can
+from starhil.hil_tests.timing.figures import CanLoad, Jitter, SerialLoad
+from starhil.hil_tests.timing.jitter import (
+    event_timer_jitter,
+    heartbeat_jitter,
+    sync_to_pdo,
+    unsolicited_jitter,
+)
+from starhil.hil_tests.timing.latency import REQUESTED_ROWS
+from starhil.hil_tests.timing.realtime import set_realtime_priority
+from starhil.hil_tests.timing.serial_load import load_serial
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.serial.cubespace import Dialect
 

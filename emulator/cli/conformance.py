@@ -139,8 +139,8 @@ def command(
 
     from starhil.hil_tests.conformance import report
     from starhil.hil_tests.conformance.conformance_run import all_cases, run_conformance
-    from starhil.hil_tests.interruption import interruptible
-    from starhil.hil_tests.results import prepare_report
+    from starhil.hil_tests.reports import prepare_report
+    from starhil.hil_tests.rig.interruption import interruptible
 
     request, junit = cases.request(bench, tuple(patterns or ()), list_only=list_only), bench.junit
     console = Console(highlight=False, quiet=as_json)

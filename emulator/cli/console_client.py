@@ -7,9 +7,9 @@ from typing import Any
 
 from starhil.emulator.console.obc import Exchange, ObcPort
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS
-from starhil.hil_tests.async_client import AsyncObcClient
+from starhil.hil_tests.client import AsyncObcClient
+from starhil.hil_tests.client.links import CanHostLink, HostLink, SerialHostLink
 from starhil.hil_tests.errors import BenchError, LinkLostError, NackError, NoReplyError
-from starhil.hil_tests.links import CanHostLink, HostLink, SerialHostLink
 from starhil.protocol.icd.codec import Row
 
 
@@ -32,7 +32,7 @@ class ConsoleClient:
         elif port.bus == "serial":
             link = SerialHostLink(port.icd, port.where, dialect=port.dialect())
         else:
-            from starhil.hil_tests.canopen_link import CanopenHostLink
+            from starhil.hil_tests.client.canopen_link import CanopenHostLink
 
             link = CanopenHostLink(port.icd, port.where, node=port.device_address())
         self._client = AsyncObcClient(link, port.icd)

@@ -33,7 +33,7 @@ def export(
 
     from starhil.emulator.fmu.export import export_fmu
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
-    from starhil.hil_tests.emulator_process import installed_command
+    from starhil.hil_tests.rig.emulator_process import installed_command
     from starid.cli.options import one_of
 
     one_of("--fmi", fmi, ("2", "3"))

@@ -13,9 +13,9 @@ from contextlib import ExitStack
 from typing import Any, Final
 
 from starhil.emulator.fmu.variables import TEXT_SIZE, variables
-from starhil.hil_tests.control import ControlClient
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.rig.control import ControlClient
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 
 VARIABLES: Final = variables()
 TEXTS: Final = [each.name for each in VARIABLES if isinstance(each.start, str)]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from starhil.hil_tests.client.raw_traffic import matches, parse_frame, pattern
 from starhil.hil_tests.conformance.case import check
 from starhil.hil_tests.conformance.link_probe import LinkProbe, ProbeTimes, Settings
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge import can
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request
-from starhil.hil_tests.raw_traffic import matches, parse_frame, pattern
 
 
 class CanProbe(LinkProbe):

@@ -27,16 +27,16 @@ from starhil.hil_tests.conformance.runner import (
 )
 from starhil.hil_tests.conformance.serial_probe import DEFAULT_BAUD, SerialProbe
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite, settings_of
-from starhil.hil_tests.control import ControlClient, Truth
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, pointed
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
-from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.judge.definition import Unit, read_unit
-from starhil.hil_tests.private_can_bus import private_can_bus
-from starhil.hil_tests.results import FAILED
-from starhil.hil_tests.run_feed import RunFeed, console_address
-from starhil.hil_tests.temporary_folder import temporary_folder
-from starhil.hil_tests.truth_log import TruthLogReader
+from starhil.hil_tests.reports import FAILED
+from starhil.hil_tests.rig.console_feed import RunFeed, console_address
+from starhil.hil_tests.rig.control import ControlClient, Truth
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, pointed
+from starhil.hil_tests.rig.interruption import Interrupted
+from starhil.hil_tests.rig.private_can_bus import private_can_bus
+from starhil.hil_tests.rig.temporary_folder import temporary_folder
+from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.protocol.errors import IcdError
 from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starhil.protocol.serial.stack import chosen_dialect

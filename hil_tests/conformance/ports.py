@@ -7,8 +7,8 @@ import queue
 import time
 from typing import Generic, Protocol, Self, TypeVar
 
+from starhil.hil_tests.client.loop_thread import LoopThread
 from starhil.hil_tests.errors import LinkLostError
-from starhil.hil_tests.loop_thread import LoopThread
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import Transport

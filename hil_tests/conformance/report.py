@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from starhil.hil_tests.conformance.runner import Outcome
-from starhil.hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED, TestCase, write_junit, write_report
+from starhil.hil_tests.reports import FAILED, NOT_RUN, PASSED, SKIPPED, TestCase, write_junit, write_report
 from starhil.protocol.errors import escape_controls
 
 STYLES: Final = {

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, Probe
 from starhil.hil_tests.errors import BenchError, LinkLostError
 from starhil.hil_tests.judge.headers import InexpressibleError
-from starhil.hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED
+from starhil.hil_tests.reports import FAILED, NOT_RUN, PASSED, SKIPPED
 from starhil.protocol.errors import ProtocolError
 
 T = TypeVar("T")

@@ -11,8 +11,8 @@ from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.runner import run_cases
 from starhil.hil_tests.conformance.suites import serial_suite
-from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.judge.definition import read_unit
+from starhil.hil_tests.rig.interruption import Interrupted
 from starhil.protocol.can.frame import CanFrame
 from tests.conformance.links import write_unit
 from tests.conformance.mutants_units import bodies

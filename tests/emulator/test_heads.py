@@ -10,8 +10,8 @@ import pytest
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions, check_heads, path_of_head, with_own_seeds
 from starhil.emulator.profile import Profile
-from starhil.hil_tests.async_client import AsyncObcClient
-from starhil.hil_tests.links import CanHostLink
+from starhil.hil_tests.client import AsyncObcClient
+from starhil.hil_tests.client.links import CanHostLink
 from tests.emulator.runs import Control
 from tests.emulator.truth.simulators import RATE_DEG_S, Stub42, blocks_of_42
 

@@ -16,9 +16,9 @@ from starhil.emulator.pipeline.messages import PipelineEnded, PipelineReady
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.replay import prepare_recording, read_run, replay
 from starhil.emulator.tape import EVENTS_FILE, RUN_FILE, SCENARIO_FILE, TRUTH_FILE
-from starhil.hil_tests.async_client import AsyncObcClient
+from starhil.hil_tests.client import AsyncObcClient
+from starhil.hil_tests.client.links import CanHostLink, SerialHostLink
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.links import CanHostLink, SerialHostLink
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import CAMERA, Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42

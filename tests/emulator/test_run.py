@@ -19,7 +19,7 @@ from starhil.emulator.profile_sections import RunConfig
 from starhil.emulator.run import Run
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
-from starhil.hil_tests.private_can_bus import hub_thread
+from starhil.hil_tests.rig.private_can_bus import hub_thread
 from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.files.bundled import bundled
 from starhil.protocol.messages import ErrorCode

@@ -22,9 +22,9 @@ from starhil.emulator.replay import EVENTS_FILE, RUN_FILE, read_events, read_run
 from starhil.emulator.truth.ccsds_file import write_aem
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth.table import FileTruth, Span
-from starhil.hil_tests.images import decode_bmp
-from starhil.hil_tests.script import load_script
-from starhil.hil_tests.truth_log import TruthLogReader
+from starhil.hil_tests.client.images import decode_bmp
+from starhil.hil_tests.rig.truth_log import TruthLogReader
+from starhil.hil_tests.session.script import load_script
 from starhil.protocol.canopen.storage import FileStorage
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FORMATS, export

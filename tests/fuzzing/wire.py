@@ -14,9 +14,9 @@ from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.truth.feed_message import JsonFormat
 from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.simulator_42 import Format42
-from starhil.hil_tests.emulator_process import parse_ready_line
-from starhil.hil_tests.raw_traffic import parse_frame as parse_cansend
-from starhil.hil_tests.raw_traffic import pattern
+from starhil.hil_tests.client.raw_traffic import parse_frame as parse_cansend
+from starhil.hil_tests.client.raw_traffic import pattern
+from starhil.hil_tests.rig.emulator_process import parse_ready_line
 from starhil.protocol.can.cubespace import (
     CanDeviceReceiver,
     CanHostReceiver,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.hil_tests.private_can_bus import hub_thread
+from starhil.hil_tests.rig.private_can_bus import hub_thread
 
 
 @pytest.fixture

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from starhil.hil_tests.attitude import attitude_error, from_radec_roll
+from starhil.hil_tests.client.images import decode_bmp, write_png
+from starhil.hil_tests.client.raw_traffic import matches, parse_frame, pattern
+from starhil.hil_tests.client.wire_log import WireLog
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.images import decode_bmp, write_png
-from starhil.hil_tests.load_figures import percentile
-from starhil.hil_tests.raw_traffic import matches, parse_frame, pattern
-from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, write_junit
-from starhil.hil_tests.truth_log import TruthLogReader
-from starhil.hil_tests.wire_log import WireLog
+from starhil.hil_tests.reports import FAILED, PASSED, SKIPPED, TestCase, write_junit
+from starhil.hil_tests.rig.truth_log import TruthLogReader
+from starhil.hil_tests.timing.figures import percentile
 from starhil.protocol.can.frame import CanFrame, bus_name
 from tests.candump import read_candump
 

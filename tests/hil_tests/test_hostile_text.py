@@ -10,7 +10,7 @@ from rich.console import Console
 
 from starhil.hil_tests.conformance.report import print_outcome, write_junit_report
 from starhil.hil_tests.conformance.runner import Outcome
-from starhil.hil_tests.results import FAILED, TestCase, write_junit
+from starhil.hil_tests.reports import FAILED, TestCase, write_junit
 from starid.cli.command_line import exit_for_bad_input
 from tests.emulator.cli.command_line import run_command_line
 

@@ -3,7 +3,7 @@
 import pytest
 
 from starhil.hil_tests.errors import ScriptError
-from starhil.hil_tests.script import load_script
+from starhil.hil_tests.session.script import load_script
 from starhil.protocol.unit import load_unit
 
 

@@ -13,12 +13,12 @@ import pytest
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
-from starhil.hil_tests import session_run
 from starhil.hil_tests.conformance import conformance_run
-from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.private_can_bus import hub_thread
-from starhil.hil_tests.results import write_report
+from starhil.hil_tests.reports import write_report
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess
+from starhil.hil_tests.rig.private_can_bus import hub_thread
+from starhil.hil_tests.session import session_run
 
 DIES = "import sys; print('ready can={}', flush=True); print('no more sky', file=sys.stderr); sys.exit(7)"
 
@@ -132,7 +132,7 @@ def test_a_report_into_a_device_leaves_the_device(tmp_path):
 def test_a_report_into_the_standard_output_comes_between_the_lines_printed_there(tmp_path):
     file = tmp_path / "output"
     code = (
-        "from pathlib import Path; from starhil.hil_tests.results import write_report; "
+        "from pathlib import Path; from starhil.hil_tests.session.results import write_report; "
         "print('before'); write_report(Path('/dev/stdout'), b'<report/>'); print('after')"
     )
     with file.open("wb") as stream:

@@ -5,11 +5,10 @@ import struct
 
 import pytest
 
-from starhil.hil_tests.async_client import AsyncObcClient
-from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.client import AsyncObcClient, ObcClient
 from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, run_conformance
 from starhil.hil_tests.errors import BenchError, NackError, ScriptError
-from starhil.hil_tests.script import load_script
+from starhil.hil_tests.session.script import load_script
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Reply, ReplyKind
 from starhil.protocol.serial.stack import SerialStack

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from starhil.hil_tests.client import ObcClient
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.private_can_bus import private_can_bus
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from starhil.protocol.transports.can import kernel_can_is_up
 
 FAST_BAUD = 921600

@@ -15,7 +15,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from starhil.hil_tests.client import ObcClient
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.protocol.files.bundled import find_unit
 from tests.process.test_sessions import starhil
 

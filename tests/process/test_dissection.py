@@ -7,7 +7,7 @@ import queue
 import canopen
 import pytest
 
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.unit import load_unit

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import binom, chi2
 
 from starhil.hil_tests.client import ObcClient
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, installed_command
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, installed_command
 from tests.emulator.cli.command_line import run_command_line
 
 pytestmark = pytest.mark.process

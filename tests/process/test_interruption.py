@@ -13,8 +13,8 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from starhil.hil_tests.emulator_process import EmulatorProcess, installed_command
-from starhil.hil_tests.temporary_folder import temporary_folder
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
+from starhil.hil_tests.rig.temporary_folder import temporary_folder
 
 pytestmark = pytest.mark.process
 
@@ -122,7 +122,7 @@ def test_a_signal_leaves_no_process_and_no_folder_behind(name, number, tmp_path)
 def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_path):
     text = (
         "import subprocess, sys, time\n"
-        "from starhil.hil_tests.emulator_process import emulator_command\n"
+        "from starhil.hil_tests.rig.emulator_process import emulator_command\n"
         f"child = subprocess.Popen(emulator_command(state_dir={str(tmp_path)!r}), stdout=subprocess.DEVNULL)\n"
         "print(child.pid, flush=True)\n"
         "time.sleep(600)\n"

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 
 pytestmark = pytest.mark.process
 

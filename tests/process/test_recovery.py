@@ -16,10 +16,10 @@ import canopen
 import pytest
 
 from starhil.hil_tests.client import ObcClient
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.client.raw_traffic import send_and_listen
 from starhil.hil_tests.errors import BenchError, DeviceError
-from starhil.hil_tests.private_can_bus import hub_thread
-from starhil.hil_tests.raw_traffic import send_and_listen
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.private_can_bus import hub_thread
 from starhil.protocol.can.frame import CanFrame
 from tests.process.conftest import FAST_BAUD
 from tests.process.reference import frame_request

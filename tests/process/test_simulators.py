@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.private_can_bus import private_can_bus
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.truth.simulators import blocks_of_42
 

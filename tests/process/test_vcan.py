@@ -15,7 +15,7 @@ import can
 import pytest
 
 from starhil.hil_tests.client import ObcClient
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from tests.candump import parse_candump, read_candump
 from tests.process.conftest import needs_vcan0
 from tests.process.test_sessions import starhil

@@ -6,9 +6,9 @@ from binascii import crc_hqx
 from typing import Final
 
 from starhil.configs.units.cubestar.controls import reset, standby
+from starhil.hil_tests.client.images import decode_bmp
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, check, check_equal
 from starhil.hil_tests.conformance.link_probe import INVALID_PARAMETER, SEQUENCE, LinkProbe
-from starhil.hil_tests.images import decode_bmp
 from starhil.hil_tests.judge.messages import Value
 
 EDGE: Final = 64

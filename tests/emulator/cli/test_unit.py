@@ -15,8 +15,8 @@ from starhil.emulator.cli.unit import group
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.run import Run
-from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.files.bundled import bundled_units, find
 from starhil.protocol.unit import load_unit

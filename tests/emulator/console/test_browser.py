@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, installed_command
-from starhil.hil_tests.private_can_bus import private_can_bus
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, installed_command
+from starhil.hil_tests.rig.private_can_bus import private_can_bus
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 WITHIN_MS = 30_000

@@ -7,9 +7,9 @@ from types import SimpleNamespace
 import pytest
 
 from starhil.emulator.console.obc import ConsoleObc, Exchange, toml
-from starhil.hil_tests.async_client import AsyncObcClient
-from starhil.hil_tests.links import CanHostLink, SerialHostLink
-from starhil.hil_tests.script import load_script
+from starhil.hil_tests.client import AsyncObcClient
+from starhil.hil_tests.client.links import CanHostLink, SerialHostLink
+from starhil.hil_tests.session.script import load_script
 from starhil.protocol.unit import load_unit
 from tests.candump import parse_candump
 from tests.emulator.console.pages import OPTIONS, WITHIN_S, Page

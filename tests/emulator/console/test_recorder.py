@@ -10,8 +10,8 @@ from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.console import recorder as recorder_module
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
-from starhil.hil_tests.async_client import AsyncObcClient
-from starhil.hil_tests.links import CanHostLink, SerialHostLink
+from starhil.hil_tests.client import AsyncObcClient
+from starhil.hil_tests.client.links import CanHostLink, SerialHostLink
 from starhil.protocol.unit import load_unit
 from tests.emulator.conftest import ORION, PREVIEW
 from tests.emulator.runs import Control, command, every_row_read

@@ -17,7 +17,7 @@ from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
 from starhil.emulator.errors import EmulatorError
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.run_feed import RunFeed
+from starhil.hil_tests.rig.console_feed import RunFeed
 from tests.emulator.conftest import PREVIEW
 from tests.emulator.console.pages import ALONG_X, OPTIONS, WITHIN_S, Page, column
 from tests.emulator.runs import command, read

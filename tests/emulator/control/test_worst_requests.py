@@ -16,7 +16,7 @@ from starhil.emulator.sky.objects import MAX_ROWS, SkyObjects
 from starhil.emulator.truth.config import MAX_SEGMENTS
 from starhil.emulator.truth.feed import MAX_LINES, LiveFeed, _Datagrams
 from starhil.emulator.truth.live import LiveTruth
-from starhil.hil_tests.script import ScriptError, load_script
+from starhil.hil_tests.session.script import ScriptError, load_script
 from starhil.protocol.errors import LONGEST_PROBLEM, MAX_PROBLEMS
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude

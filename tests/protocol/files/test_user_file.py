@@ -13,8 +13,8 @@ from starhil.emulator.profile import load_profile
 from starhil.emulator.truth.file import read_truth_file
 from starhil.hil_tests.conformance.case_file import text_cases
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.script import load_script
-from starhil.hil_tests.truth_log import TruthLogReader
+from starhil.hil_tests.rig.truth_log import TruthLogReader
+from starhil.hil_tests.session.script import load_script
 from starhil.protocol.canopen.storage import FileStorage
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.files.user_file import (

@@ -1,0 +1,1 @@
+"""What stands around a unit under test: emulator, links, control channel, bus, folder."""

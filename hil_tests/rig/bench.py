@@ -1,0 +1,138 @@
+"""Access to the unit under test: clients and logs on its links, and the emulator if there is one."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.client.async_client import DEFAULT_TIMEOUT_S
+from starhil.hil_tests.client.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
+from starhil.hil_tests.client.wire_log import WireLog
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.rig.control import ControlClient
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess
+from starhil.protocol.can.frame import bus_name
+from starhil.protocol.icd import InterfaceDefinition
+
+
+@dataclass(frozen=True)
+class LinkOptions:
+    """Options of the links and of the clients.
+
+    `serial` and `can` are port and channel, None if the link is not used, `auto` for those on the ready line of the emulator
+    that the bench started.
+    """
+
+    serial: str | None = None
+    can: str | None = None
+    dialect: str | None = None
+    baud: int = DEFAULT_BAUD
+    host_address: int = DEFAULT_HOST_ADDRESS
+    device_address: int = DEFAULT_DEVICE_ADDRESS
+    timeout_s: float = DEFAULT_TIMEOUT_S
+    retries: int = 0
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links in use: `serial`, `can` or both."""
+        return tuple(name for name in ("serial", "can") if getattr(self, name) is not None)
+
+
+class Bench:
+    """Clients of one unit: a context manager that opens them on first use and closes them all.
+
+    On exit it raises `EmulatorProcessError` if the emulator ended unexpectedly or does not end cleanly.
+
+    The bench starts and ends `emulator`, a process that has not been started; `log_folder` gets `serial.log` and `can.log`.
+    """
+
+    def __init__(
+        self,
+        options: LinkOptions,
+        icd: InterfaceDefinition,
+        *,
+        emulator: EmulatorProcess | None = None,
+        log_folder: Path | None = None,
+    ) -> None:
+        self.options = options
+        self.links = options.links
+        self.icd = icd
+        self.emulator = emulator
+        self.log_folder = log_folder
+        self.logs: dict[str, WireLog] = {}
+        self._clients: dict[str, ObcClient] = {}
+        self._stack = ExitStack()
+
+    def client(self, link: str) -> ObcClient:
+        """Return the client on a link, opened at the first call."""
+        if link not in self.links:
+            raise BenchError(f"this bench has no {link} link; it has {' and '.join(self.links)}")
+        if link not in self._clients:
+            self._clients[link] = self._open(link)
+        return self._clients[link]
+
+    def _open(self, link: str) -> ObcClient:
+        port = self._port(link)
+        if self.log_folder is not None and link not in self.logs:
+            bus = bus_name(port) if link == "can" else ""
+            self.logs[link] = self._stack.enter_context(WireLog(self.log_folder / f"{link}.log", bus))
+        options = {**vars(self.options), "serial": None, "can": None, link: port}
+        return ObcClient.open(**options, unit=self.icd, log=self.logs.get(link))
+
+    def _port(self, link: str) -> str:
+        port = str(getattr(self.options, link))
+        if self.emulator is None or port != "auto":
+            return port
+        if link not in self.emulator.ready:
+            raise BenchError(
+                f"the emulator did not open a {link} link; its ready line has {self.emulator.ready}"
+            )
+        return self.emulator.ready[link]
+
+    @property
+    def _own_emulator(self) -> EmulatorProcess:
+        if self.emulator is None:
+            raise BenchError("only an emulator that the bench started can do this: use --start")
+        return self.emulator
+
+    def close_clients(self) -> None:
+        """Close all clients; they are opened again on next use."""
+        clients, self._clients = list(self._clients.values()), {}
+        for client in clients:
+            client.close()
+
+    def control(self, action: str, keys: Mapping[str, Any]) -> dict[str, Any]:
+        """Send a request on the control channel of the emulator, and return its answer.
+
+        Raises BenchError: the request was rejected, or the unit is not an emulator that the bench started.
+        """
+        with ControlClient(self._own_emulator.ready["control"]) as channel:
+            return channel.do(action, **keys)
+
+    def restart(self, how: str) -> None:
+        """End the emulator by SIGTERM (`term`) or SIGKILL (`kill`) and start it again.
+
+        Raises BenchError: the unit is not an emulator that the bench started.
+        """
+        emulator = self._own_emulator
+        self.close_clients()
+        emulator.restart(signal.SIGKILL if how == "kill" else signal.SIGTERM)
+
+    def __enter__(self) -> Self:
+        if self.log_folder is not None:
+            self.log_folder.mkdir(parents=True, exist_ok=True)
+        if self.emulator is not None:
+            self._stack.enter_context(self.emulator)
+        self._stack.callback(self.close_clients)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)

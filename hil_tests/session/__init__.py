@@ -1,0 +1,5 @@
+"""Session scripts: read, checked, run, reported."""
+
+from starhil.hil_tests.session.session_run import SessionRequest, run_session
+
+__all__ = ["SessionRequest", "run_session"]

@@ -1,0 +1,107 @@
+"""Run the steps of a session script on a bench, each over its links."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.reports import FAILED, PASSED, SKIPPED
+from starhil.hil_tests.rig.bench import Bench
+from starhil.hil_tests.rig.interruption import Interrupted
+from starhil.hil_tests.rig.truth_log import TruthLogReader
+from starhil.hil_tests.session.results import SessionResult, StepResult
+from starhil.hil_tests.session.script import Script
+from starhil.hil_tests.session.steps import Attempt, Session, Step
+from starhil.protocol.errors import ProtocolError
+
+
+def run_steps(
+    script: Script,
+    bench: Bench,
+    folder: Path,
+    *,
+    on_result: Callable[[StepResult], None] = lambda _result: None,
+    truth_path: Path | None = None,
+) -> SessionResult:
+    """Run all steps; after a failed one skip the others, unless the script sets `keep_going`.
+
+    `folder` gets CSV and image files; `truth_path` is a file of true attitudes instead of the script's truth. A signal,
+    whether during a step or while a result is shown, ends the run; the results of earlier steps are kept.
+    """
+    if truth_path is None and script.truth.file is not None:
+        truth_path = folder / script.truth.file
+    truth = script.truth.attitude if truth_path is None else TruthLogReader(truth_path)
+    session = Session(bench, folder, truth)
+    begin = time.monotonic()
+    planned = script.planned(bench.links)
+    results: list[StepResult] = []
+    interruption = None
+
+    def record(result: StepResult) -> None:
+        results.append(result)
+        on_result(result)
+
+    def skip_rest(reason: str) -> None:
+        for number, step, link in planned[len(results) :]:
+            record(StepResult(number, step.name, link, SKIPPED, reason, 0.0))
+
+    try:
+        for number, step, link in planned:
+            record(_run_step(session, number, step, link))
+            if results[-1].status == FAILED and not script.defaults.keep_going:
+                break
+        skip_rest("an earlier step failed")
+    except Interrupted as signalled:
+        interruption = signalled
+        skip_rest(f"not run: {signalled.reason}")
+    return SessionResult(script.title, tuple(results), time.monotonic() - begin, interruption)
+
+
+def _run_step(session: Session, number: int, step: Step, link: str) -> StepResult:
+    begin = session.step_begin_s = time.monotonic()
+    links = session.bench.links
+    if link and link not in links:
+        detail = f"needs a {link} link, the session has {' and '.join(links)}"
+        return StepResult(number, step.name, link, SKIPPED, detail, 0.0)
+    for log in session.bench.logs.values():
+        log.note(f"step {number}: {step.name}")
+    attempt = Attempt()
+    for turn in range(step.repeat):
+        if turn:
+            time.sleep(step.pause_s)
+        attempt = _try_until_passed(session, step, link)
+        if attempt.problem is not None:
+            if step.repeat > 1:
+                attempt.problem = f"time {turn + 1} of {step.repeat}: {attempt.problem}"
+            break
+    status, detail = (PASSED, attempt.detail) if attempt.problem is None else (FAILED, attempt.problem)
+    found = attempt.latency_s, attempt.values, attempt.figures
+    return StepResult(number, step.name, link, status, detail, time.monotonic() - begin, *found)
+
+
+def _try_until_passed(session: Session, step: Step, link: str) -> Attempt:
+    """Try an action once, or repeatedly until its expectations hold or its time is over."""
+    deadline = None if step.within_s is None else time.monotonic() + step.within_s
+    while True:
+        attempt = _try_once(session, step, link)
+        if attempt.problem is None or deadline is None:
+            return attempt
+        if time.monotonic() >= deadline:
+            attempt.problem = f"not within {step.within_s:g} s: {attempt.problem}"
+            return attempt
+        time.sleep(min(step.pause_s, max(0.0, deadline - time.monotonic())))
+
+
+def _try_once(session: Session, step: Step, link: str) -> Attempt:
+    try:
+        attempt = step.run(session, link)
+    except (BenchError, ProtocolError) as error:
+        return Attempt(problem=str(error))
+    limit, latency = step.max_latency_s, attempt.latency_s or 0.0
+    if attempt.problem is None and limit is not None and latency > limit:
+        attempt.problem = f"latency {latency:.4f} s, expected at most {limit:g} s"
+    if attempt.problem is None:
+        session.captured.update({name: attempt.values[key] for name, key in step.capture.items()})
+    return attempt

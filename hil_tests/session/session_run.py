@@ -1,0 +1,232 @@
+"""A complete session: load the script, set up the bench, run the steps, write the reports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from rich.console import Console
+from rich.text import Text
+
+from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError
+from starhil.hil_tests.reports import FAILED, PASSED, SKIPPED, prepare_report, write_junit
+from starhil.hil_tests.rig.bench import Bench, LinkOptions
+from starhil.hil_tests.rig.console_feed import RunFeed, console_address
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, pointed
+from starhil.hil_tests.rig.interruption import Interrupted
+from starhil.hil_tests.rig.private_can_bus import private_can_bus
+from starhil.hil_tests.rig.temporary_folder import temporary_folder
+from starhil.hil_tests.session.results import SessionResult, StepResult, junit_cases
+from starhil.hil_tests.session.script import Script, load_script
+from starhil.hil_tests.session.session import run_steps
+from starhil.hil_tests.session.steps import Control, Listen
+from starhil.protocol.errors import escape_controls
+from starhil.protocol.files.bundled import DEFAULT_UNIT, find, not_found
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.unit import load_unit
+
+DEFAULT_FOLDER: Final = Path("out") / "session"
+STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED: ("-", "yellow")}
+
+
+@dataclass(frozen=True)
+class SessionRequest:
+    """Options of the user; see `starhil session --help`."""
+
+    script: Path
+    options: LinkOptions
+    unit: str | None = None
+    start: bool = False
+    profile: str | None = None
+    folder: Path | None = None
+    junit: Path | None = None
+    truth: Path | None = None
+    keep_going: bool = False
+    quiet: bool = False
+    view: str | None = None
+    """Address of the console that shows the results; `auto` with `start`: the started emulator's."""
+
+
+def find_script(path: Path) -> Path:
+    """Return the script file; a plain name refers to a bundled script.
+
+    Raises ScriptError: there is no such script; the text suggests similar names.
+    """
+    found = find("session", path)
+    if not found.is_file():
+        raise ScriptError(not_found("session", path))
+    return found
+
+
+def run_session(request: SessionRequest) -> SessionResult:
+    """Run a session and return its result.
+
+    Raises BenchError: the script is invalid, a port is not available, or the emulator does not start.
+    """
+    icd = load_unit(request.unit or DEFAULT_UNIT)
+    path = find_script(request.script)
+    script = load_script(path, icd)
+    if request.keep_going:
+        script.defaults.keep_going = True
+    options = _options(request, script)
+    _check_steps(path, script, icd, options.links, start=request.start)
+    folder = request.folder or DEFAULT_FOLDER / path.stem
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BenchError(f"{folder}: the log folder cannot be created: {error.strerror}") from None
+    if request.junit is not None:
+        prepare_report(request.junit)
+    console = Console(highlight=False, quiet=request.quiet)
+    console.print(Text(escape_controls(script.title), style="bold"))
+    show: Callable[[StepResult], None] = partial(_print_result, console)
+    result: SessionResult | None = None
+    try:
+        with ExitStack() as stack:
+            bench = _open_bench(request, script, options, icd, folder, stack)
+            show = _shown_on_console(request.view, script, bench, stack, show)
+            result = run_steps(script, bench, folder, on_result=show, truth_path=request.truth)
+        if all(step.status == SKIPPED for step in result.results) and result.interruption is None:
+            result = _failed(result, "at least one step runs", "every step is skipped", show)
+    except EmulatorProcessError as error:
+        if result is None:
+            raise
+        result = _failed(result, "the emulator runs until it is ended", str(error), show)
+    except Interrupted as interruption:  # before the first step, or after the last one
+        if result is None:
+            reason = f"not run: {interruption.reason}"
+            steps = enumerate(script.steps, 1)
+            skipped = (StepResult(number, step.name, "", SKIPPED, reason, 0.0) for number, step in steps)
+            result = SessionResult(script.title, tuple(skipped), 0.0)
+        result = replace(result, interruption=interruption)
+    if request.junit is not None:
+        write_junit(request.junit, script.title, junit_cases(result, path.stem), result.seconds)
+    counts = ", ".join(f"{result.count(status)} {status}" for status in STYLES)
+    style = "green" if result.passed else "bold red"
+    console.print(Text(f"{counts} in {result.seconds:.1f} s; logs in {folder}", style=style), soft_wrap=True)
+    return result
+
+
+def _check_steps(
+    path: Path, script: Script, icd: InterfaceDefinition, links: tuple[str, ...], *, start: bool
+) -> None:
+    """Raise ScriptError if a step can never pass on these links, or needs an emulator that the bench starts."""
+    for number, step, link in script.planned(links):
+        why = ""
+        if step.needs_emulator and not start:
+            why = "only an emulator that the bench started can do this: use --start"
+        elif isinstance(step, Listen) and link == "can" and icd.link.can is None:
+            why = f"unit {icd.name} has only CANopen on CAN, where no row is sent without a request; read it"
+        if why:
+            raise ScriptError(f"{path.name}: step {number}: {type(step).__name__.lower()}: {why}")
+
+
+def _failed(
+    result: SessionResult, name: str, detail: str, show: Callable[[StepResult], None]
+) -> SessionResult:
+    """Return a result with one more step, which has failed."""
+    end = StepResult(result.results[-1].number + 1, name, "", FAILED, detail, 0.0)
+    show(end)
+    return replace(result, results=(*result.results, end))
+
+
+def _open_bench(
+    request: SessionRequest,
+    script: Script,
+    options: LinkOptions,
+    icd: InterfaceDefinition,
+    folder: Path,
+    stack: ExitStack,
+) -> Bench:
+    """Open the bench with its links, and start the emulator if requested."""
+    emulator = None
+    if request.start:
+        if options.can == "auto":
+            options = replace(options, can=stack.enter_context(private_can_bus()))
+        state = stack.enter_context(temporary_folder("starhil-session-"))
+        emulator = _emulator(request, script, options, folder, state)
+    bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
+    if emulator is not None:
+        emulator.check_unit(request.unit)
+    for link in bench.links:
+        bench.client(link)  # report a missing port before the first step
+    return bench
+
+
+def _shown_on_console(
+    view: str | None, script: Script, bench: Bench, stack: ExitStack, show: Callable[[StepResult], None]
+) -> Callable[[StepResult], None]:
+    """Return a function that shows a result, also on the console if there is one."""
+    if view is None:
+        return show
+    address = console_address(view, bench.emulator)
+    unit = ", ".join(f"{link} {getattr(bench.options, link)}" for link in bench.links)
+    planned = len(script.planned(bench.links))
+    feed = stack.enter_context(
+        RunFeed(address, kind="session", title=script.title, unit=unit, planned=planned)
+    )
+
+    def show_on_both(result: StepResult) -> None:
+        show(result)
+        shown = {key: getattr(result, key) for key in ("name", "status", "detail", "link", "seconds")}
+        feed.result(id=str(result.number), **shown)
+
+    return show_on_both
+
+
+def _options(request: SessionRequest, script: Script) -> LinkOptions:
+    options = request.options
+    if options.serial is None and options.can is None:
+        if not request.start:
+            raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
+        wanted = script.defaults.link or "serial"
+        serial, can = ("auto" if wanted in (link, "both") else None for link in ("serial", "can"))
+        options = replace(options, serial=serial, can=can)
+    if not request.start and options.serial == "auto":
+        raise BenchError("--serial auto needs --start; otherwise name the port")
+    return replace(options, timeout_s=script.defaults.timeout_s, retries=script.defaults.retries)
+
+
+def _emulator(
+    request: SessionRequest, script: Script, options: LinkOptions, folder: Path, state: Path
+) -> EmulatorProcess:
+    """Prepare an emulator for the session, with an empty parameter store."""
+    wanted = script.emulator
+    beside = find_script(request.script).parent / (wanted.profile or "")
+    truth_log = None
+    if script.truth.file is not None and request.truth is None:
+        truth_log = folder / script.truth.file
+    extra = ["--view", "auto"] if request.view == "auto" else []
+    extra += ["--control", "auto"] if any(isinstance(step, Control) for step in script.steps) else []
+    return EmulatorProcess(
+        emulator_command(
+            profile=request.profile or (str(beside) if beside.is_file() else wanted.profile),
+            unit=request.unit,
+            serial=options.serial or "off",
+            can=options.can or "off",
+            dialect=options.dialect,
+            seed=wanted.seed,
+            settings=pointed(script.truth.attitude, wanted.settings),
+            state_dir=state,
+            truth_log=truth_log,
+            extra=extra,
+        )
+    )
+
+
+def _print_result(console: Console, result: StepResult) -> None:
+    mark, style = STYLES[result.status]
+    line = Text(f"{mark} ", style=style)
+    line.append(f"{result.number:3d}  ", style="dim")
+    line.append(escape_controls(result.name))
+    if result.link:
+        line.append(f"  [{result.link}]", style="dim")
+    if result.latency_s is not None:
+        line.append(f"  {result.latency_s:.4f} s", style="cyan")
+    if result.detail:
+        line.append(f"  {escape_controls(result.detail)}", style="red" if result.status == FAILED else "dim")
+    console.print(line, soft_wrap=True)

@@ -1,0 +1,1 @@
+"""Links under load: lost frames, latency, jitter."""
