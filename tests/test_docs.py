@@ -22,14 +22,14 @@ import pytest
 
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import load_profile
+from starhil.emulator.profile.pipeline_setup import pipeline_setup
+from starhil.emulator.run.truth_log import COLUMNS
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import render
-from starhil.emulator.sky.view import Sky
+from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.truth.csv_file import BOUNDS
 from starhil.emulator.truth.source import TruthStatus
-from starhil.emulator.truth_log import COLUMNS
 from starhil.hil_tests.client.raw_traffic import parse_frame
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import hub_thread, private_can_bus

@@ -22,7 +22,7 @@ COPIED = ("starhil", "emulator", "protocol", "hil_tests", "configs", "starid")
 SEARCH = """
 import itertools, logging, sys, time
 from starhil.emulator.cli.endurance import run_once
-from starhil.emulator.endurance.unit_under_test import links_of
+from starhil.emulator.launch.unit_in_memory import links_of
 from starhil.hil_tests.endurance.life import make_life
 from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.unit import load_unit

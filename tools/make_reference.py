@@ -290,7 +290,14 @@ def sensor() -> str:
 
 def sky() -> str:
     """Keys of `[sky]` and of the tables in it."""
-    from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
+    from starhil.emulator.sensor.sky.objects import (
+        EarthLimb,
+        Moon,
+        Obstruction,
+        PointSource,
+        SkyObjects,
+        SunGlare,
+    )
 
     bodies = {
         "moon": Moon,
@@ -327,7 +334,7 @@ def identifier() -> str:
     """Options of each algorithm, as the emulator accepts them in `[identifier]`."""
     import importlib
 
-    from starhil.emulator.profile_sections import RunConfig
+    from starhil.emulator.profile.sections import RunConfig
     from starid.identification.interface import ALGORITHMS
 
     parts = []
@@ -347,7 +354,7 @@ def identifier() -> str:
 def accepted_options(algorithm: str) -> list[str]:
     """Return the options that the emulator lists when it rejects an unknown one."""
     from starhil.emulator.errors import EmulatorError
-    from starhil.emulator.pipeline.star_identifiers import StarIdentifierSetup
+    from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifierSetup
     from starid.camera import DEFAULT_CAMERA
     from starid.catalog import load_catalog
 
@@ -360,7 +367,7 @@ def accepted_options(algorithm: str) -> list[str]:
 
 def faults() -> str:
     """Keys of the tables of a `fault` request, except optical faults, whose keys are those of `[sky]`."""
-    from starhil.emulator.faults import DeviceFault, WireFault
+    from starhil.emulator.run.faults import DeviceFault, WireFault
     from starhil.protocol.unit import load_unit
 
     enums = load_unit().enums
@@ -470,7 +477,7 @@ def snapshot() -> str:
     from starhil.emulator.device.reported import Reported
     from starhil.emulator.device.snapshot import Constants, Snapshot
     from starhil.emulator.device.stored_images import FileState, ImageState, StoredImage
-    from starhil.emulator.pipeline.messages import FrameResult, MatchedStar
+    from starhil.emulator.sensor.pipeline.messages import FrameResult, MatchedStar
 
     return "\n\n".join(
         f"### `{kind.__name__}`\n\n{plain_text((kind.__doc__ or '').splitlines()[0])}\n\n"

@@ -24,10 +24,10 @@ from starhil.emulator.device.parameters import Parameters, exposure_period_s, so
 from starhil.emulator.device.power import FrameTiming, PowerModel
 from starhil.emulator.device.surroundings import orbit_of
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline.messages import FrameRequest, FrameResult, camera_constants
-from starhil.emulator.pipeline.pipeline import Pipeline
-from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import load_profile
+from starhil.emulator.profile.pipeline_setup import pipeline_setup
+from starhil.emulator.sensor.pipeline.messages import FrameRequest, FrameResult, camera_constants
+from starhil.emulator.sensor.pipeline.pipeline import Pipeline
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.unit import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude

@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline.bodies import bodies_in_field
+from starhil.emulator.sensor.pipeline.bodies import bodies_in_field
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
-from starhil.emulator.sky.light import through_baffle
-from starhil.emulator.sky.view import Sky
+from starhil.emulator.sensor.sky.light import through_baffle
+from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.truth.orbit import KeplerOrbit
 from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera

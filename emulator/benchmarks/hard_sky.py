@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.sensor.model import SensorModel
-from starhil.emulator.sky.objects import Moon, PointSource, SkyObjects, SunGlare
+from starhil.emulator.sensor.sky.objects import Moon, PointSource, SkyObjects, SunGlare
 from starid.arrays import Array
 from starid.attitude import Attitude
 

@@ -60,11 +60,11 @@ def warm(
 
     from starhil.emulator.device.device import adopt_camera, profile_defaults
     from starhil.emulator.device.parameters import Parameters, solver_settings
-    from starhil.emulator.pipeline.imager import WorkerImager
-    from starhil.emulator.pipeline.messages import IndexRequest, camera_constants
-    from starhil.emulator.pipeline.worker_process import WorkerProcess
-    from starhil.emulator.pipeline_setup import pipeline_setup
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
+    from starhil.emulator.profile.pipeline_setup import pipeline_setup
+    from starhil.emulator.sensor.pipeline.imager import WorkerImager
+    from starhil.emulator.sensor.pipeline.messages import IndexRequest, camera_constants
+    from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
     from starhil.protocol.unit import load_unit
     from starid.storage.cache import cache_dir, kernels_written_since
 

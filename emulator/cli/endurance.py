@@ -133,7 +133,7 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
 
 def live_from_seed(unit: str, seed: int, steps: int, kind: str, folder: Path) -> dict[str, Any]:
     """Generate a life and live it."""
-    from starhil.emulator.endurance.unit_under_test import links_of
+    from starhil.emulator.launch.unit_in_memory import links_of
     from starhil.hil_tests.endurance.life import make_life
     from starhil.hil_tests.judge.definition import unit_of
     from starhil.protocol.unit import load_unit
@@ -182,8 +182,8 @@ def live(life: Any, folder: Path) -> dict[str, Any]:
 
 def run_once(life: Any, *, record: Path | None = None) -> Any:
     """Live a life once and return its outcome."""
-    from starhil.emulator.endurance.simulated_loop import SimulatedLoop
-    from starhil.emulator.endurance.unit_under_test import UnitUnderTest
+    from starhil.emulator.launch.simulated_loop import SimulatedLoop
+    from starhil.emulator.launch.unit_in_memory import UnitUnderTest
     from starhil.hil_tests.endurance.run import LifeRun
     from starhil.hil_tests.judge.definition import unit_of
     from starhil.protocol.unit import load_unit

@@ -25,7 +25,7 @@ def command(
     import asyncio
     import signal
 
-    from starhil.emulator.guard import log_loop_errors_once
+    from starhil.emulator.simulation.guard import log_loop_errors_once
     from starhil.protocol.transports.hub import DEFAULT_BUS, CanHub
 
     if log is not None:

@@ -18,7 +18,7 @@ from starid.cli.output import output_help, prepare_output, report_stream
 if TYPE_CHECKING:
     from starhil.emulator.sensor.model import SensorModel
     from starhil.emulator.sensor.renderer import Frame
-    from starhil.emulator.sky.view import SkyView
+    from starhil.emulator.sensor.sky.view import SkyView
     from starid.camera import Camera
     from starid.catalog import StarCatalog
 
@@ -156,8 +156,8 @@ def command(
 def _scene(profile: str | None) -> tuple[Camera, SensorModel, SkyView, StarCatalog]:
     """Return camera, sensor, sky and catalogue of a profile; without one, the defaults and an empty sky."""
     from starhil.emulator.sensor.model import SensorModel
-    from starhil.emulator.sky.objects import SkyObjects
-    from starhil.emulator.sky.view import Sky, SkyView
+    from starhil.emulator.sensor.sky.objects import SkyObjects
+    from starhil.emulator.sensor.sky.view import Sky, SkyView
     from starid.camera import Camera
     from starid.catalog import load_catalog
 
@@ -166,8 +166,8 @@ def _scene(profile: str | None) -> tuple[Camera, SensorModel, SkyView, StarCatal
     from starhil.emulator.device.device import profile_defaults
     from starhil.emulator.device.parameters import Parameters
     from starhil.emulator.device.surroundings import orbit_of
-    from starhil.emulator.pipeline_setup import pipeline_setup
     from starhil.emulator.profile import load_profile
+    from starhil.emulator.profile.pipeline_setup import pipeline_setup
     from starhil.protocol.unit import load_unit
 
     loaded = load_profile(profile)

@@ -34,8 +34,8 @@ def command(
     import json
 
     from starhil.emulator.errors import EmulatorError
+    from starhil.emulator.launch.replay import replay
     from starhil.emulator.profile import load_profile
-    from starhil.emulator.replay import replay
 
     if overrides and profile is None:
         raise EmulatorError("--set: changes the profile given by --profile; give both")

@@ -206,7 +206,7 @@ def command(
     `ready serial=… dialect=… can=… seed=…`. The exit status is 1 if a log, a recording or the state could not be
     written, for example because the disk is full; the run goes on without it.
     """
-    from starhil.emulator.pipeline.worker_process import take_worker
+    from starhil.emulator.sensor.pipeline.worker_process import take_worker
 
     worker = take_worker()  # first, to start up in parallel with the imports below
 
@@ -245,7 +245,7 @@ async def _serve(make: Callable[[], Emulator]) -> int:
     import gc
     import signal
 
-    from starhil.emulator.guard import log_loop_errors_once
+    from starhil.emulator.simulation.guard import log_loop_errors_once
 
     emulator = make()
     loop = asyncio.get_running_loop()

@@ -10,7 +10,6 @@ from collections.abc import Awaitable, Callable
 from functools import partial
 from typing import Any, Final
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.console.describe import describe, load_bright_stars
 from starhil.emulator.console.history import History, frame_message, json_row
 from starhil.emulator.console.obc import POLL_S, ConsoleObc, Exchange, ObcClient
@@ -22,10 +21,11 @@ from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.guard import log_internal_error, one_line
-from starhil.emulator.head import Head
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.emulator.run import Run
+from starhil.emulator.run.head import Head
+from starhil.emulator.simulation.clock import NANOSECONDS
+from starhil.emulator.simulation.guard import log_internal_error, one_line
 from starhil.protocol.errors import ProtocolError
 from starid.errors import StaridError
 

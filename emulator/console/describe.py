@@ -11,11 +11,11 @@ import numpy as np
 
 from starhil.emulator.console.history import COLUMNS, KEPT_ROWS, MODES
 from starhil.emulator.console.pointing import DEFAULT_RATE_DEG_S
-from starhil.emulator.faults import NO_ERROR, DeviceFault
-from starhil.emulator.head import Head
 from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.run import Run
-from starhil.emulator.sky.objects import SkyObjects
+from starhil.emulator.run.faults import NO_ERROR, DeviceFault
+from starhil.emulator.run.head import Head
+from starhil.emulator.sensor.sky.objects import SkyObjects
 from starhil.protocol.files.bundled import bundled
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Field, Row

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode
+from starhil.emulator.simulation.clock import NANOSECONDS
 from starid.attitude import ARCSEC_PER_RAD, Attitude
 
 COLUMNS: Final = (

@@ -6,10 +6,10 @@ import os
 from collections.abc import Callable
 
 from starhil.emulator.console.obc import Bus, MakeClient, ObcClient, ObcPort
-from starhil.emulator.head import Head
 from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
+from starhil.emulator.run.head import Head
 from starhil.protocol.icd import InterfaceDefinition
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.signals import Signal
+from starhil.emulator.simulation.signal import Signal
 
 KEPT_RUNS: Final = 20
 KEPT_RESULTS: Final = 2000

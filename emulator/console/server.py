@@ -19,7 +19,7 @@ from starhil.emulator.console.console import Console
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.control.token import is_token
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.json_lines import JsonError, parse_object
+from starhil.emulator.truth.json_lines import JsonError, parse_object
 from starhil.protocol.errors import reason
 from starhil.protocol.transports.connections import REQUEST_S, ConnectionLimit, limit_unsent
 

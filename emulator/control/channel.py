@@ -25,21 +25,21 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.control.token import is_token
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.errors import EmulatorError, explained
-from starhil.emulator.faults import FaultRequest
-from starhil.emulator.guard import until_cancelled
-from starhil.emulator.head import Head
-from starhil.emulator.json_lines import JsonError, parse_object, read_lines
-from starhil.emulator.pipeline.messages import as_quaternion
 from starhil.emulator.run import Run
+from starhil.emulator.run.faults import FaultRequest
+from starhil.emulator.run.head import Head
+from starhil.emulator.run.truth_log import compare
+from starhil.emulator.sensor.pipeline.messages import as_quaternion
+from starhil.emulator.simulation.clock import NANOSECONDS
+from starhil.emulator.simulation.guard import until_cancelled
 from starhil.emulator.truth.config import TruthConfig
+from starhil.emulator.truth.json_lines import JsonError, parse_object, read_lines
 from starhil.emulator.truth.live import LiveTruth
-from starhil.emulator.truth_log import compare
 from starhil.protocol.errors import ProtocolError, did_you_mean, remedy
 from starhil.protocol.files.validation import problems
 from starhil.protocol.transports.connections import REQUEST_S, ConnectionLimit

@@ -24,12 +24,12 @@ from typing import Annotated, Final, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.scheduler import Action
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.faults import FaultRequest
-from starhil.emulator.head import Head
-from starhil.emulator.toml_file import find_toml, read_toml
+from starhil.emulator.profile.toml_file import find_toml, read_toml
+from starhil.emulator.run.faults import FaultRequest
+from starhil.emulator.run.head import Head
+from starhil.emulator.simulation.clock import NANOSECONDS
+from starhil.emulator.simulation.scheduler import Action
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.truth import Truth
 from starhil.protocol.errors import did_you_mean

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from starhil.emulator.errors import EmulatorError, explained
-from starhil.emulator.symlink_lock import LockError, lock_name
+from starhil.emulator.links.name_lock import LockError, lock_name
 
 PRIVATE_FOLDER: Final = 0o700
 PRIVATE_SOCKET: Final = 0o600

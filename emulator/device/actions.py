@@ -12,7 +12,6 @@ import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, Final, TypeAlias
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.counters import Counters
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.images import edge_of
@@ -20,6 +19,7 @@ from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.subscriptions import Subscription
+from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.protocol.icd.values import MessageError, Value
 from starhil.protocol.messages import ErrorCode, Reply
 

@@ -18,18 +18,17 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from starhil.emulator.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Modes
 from starhil.emulator.device.navigation import observer_velocity
 from starhil.emulator.device.parameters import Parameters, exposure_period_s, solver_settings
 from starhil.emulator.device.power import FrameTiming
 from starhil.emulator.device.rate import RateEstimator
-from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.signals import Signals
 from starhil.emulator.device.surroundings import Surroundings
-from starhil.emulator.pipeline.imager import Imager, PipelineReply
-from starhil.emulator.pipeline.messages import (
+from starhil.emulator.profile import Profile
+from starhil.emulator.sensor.pipeline.imager import Imager, PipelineReply
+from starhil.emulator.sensor.pipeline.messages import (
     ZERO,
     CatalogUpset,
     Failure,
@@ -38,7 +37,8 @@ from starhil.emulator.pipeline.messages import (
     IndexRequest,
     Triple,
 )
-from starhil.emulator.profile import Profile
+from starhil.emulator.simulation.clock import NANOSECONDS, DeviceTime
+from starhil.emulator.simulation.scheduler import Event, Scheduler
 from starhil.emulator.truth.source import TruthState
 from starid.arrays import Array
 from starid.attitude import Attitude, propagate

@@ -8,7 +8,6 @@ from functools import reduce
 from types import MappingProxyType
 from typing import Any, Final, TypeAlias
 
-from starhil.emulator.clock import NANOSECONDS, Clock, DeviceTime
 from starhil.emulator.device.counters import Acknowledge, Counters
 from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.file_download import FileDownload
@@ -19,18 +18,19 @@ from starhil.emulator.device.parameters import Parameters, ParameterValue
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.power import PowerModel, ThermalModel
 from starhil.emulator.device.reported import reported
-from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.signals import Signals
 from starhil.emulator.device.snapshot import Constants, Snapshot
 from starhil.emulator.device.state_store import StateStore
 from starhil.emulator.device.subscriptions import Subscriptions
 from starhil.emulator.device.surroundings import Surroundings
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.guard import log_internal_error, one_line
-from starhil.emulator.output_file import Output
-from starhil.emulator.pipeline.imager import Imager
-from starhil.emulator.pipeline.messages import IDENTITY, Quaternion
 from starhil.emulator.profile import Profile
+from starhil.emulator.sensor.pipeline.imager import Imager
+from starhil.emulator.sensor.pipeline.messages import IDENTITY, Quaternion
+from starhil.emulator.simulation.clock import NANOSECONDS, Clock, DeviceTime
+from starhil.emulator.simulation.guard import log_internal_error, one_line
+from starhil.emulator.simulation.output_file import Output
+from starhil.emulator.simulation.scheduler import Event, Scheduler
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.images import ImageStore
 from starhil.emulator.device.stored_images import BMP_TYPE, FileState
+from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.protocol.image_transfer import (
     MAX_BLOCK,
     MAX_PACKETS,

@@ -9,14 +9,14 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
 
-from starhil.emulator.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.pending import PendingAnswer
-from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.device.signals import Signals
 from starhil.emulator.device.stored_images import ImageState, StoredImage
-from starhil.emulator.pipeline.imager import Imager, PipelineReply
-from starhil.emulator.pipeline.messages import IMAGE_EDGES, ImageRequest, ImageResult
+from starhil.emulator.sensor.pipeline.imager import Imager, PipelineReply
+from starhil.emulator.sensor.pipeline.messages import IMAGE_EDGES, ImageRequest, ImageResult
+from starhil.emulator.simulation.clock import NANOSECONDS, DeviceTime
+from starhil.emulator.simulation.scheduler import Scheduler
 
 STORE_S: Final = 0.1
 """Modelled time to store an image, seconds."""

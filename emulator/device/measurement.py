@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from starhil.emulator.device.modes import Mode
-from starhil.emulator.pipeline.messages import ZERO, FrameResult, Triple
+from starhil.emulator.sensor.pipeline.messages import ZERO, FrameResult, Triple
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.icd.conventions import NANOSECONDS
 

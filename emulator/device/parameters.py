@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from starhil.emulator.device.navigation import perigee_below_surface
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline.messages import SolverSettings
+from starhil.emulator.sensor.pipeline.messages import SolverSettings
 from starhil.protocol.icd import FieldError, InterfaceDefinition
 from starhil.protocol.icd.codec import STRUCT_CODES
 from starhil.protocol.icd.values import MessageError, Parameter, Value

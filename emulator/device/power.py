@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from starhil.emulator.profile_sections import PowerConfig, ThermalConfig
+from starhil.emulator.profile.sections import PowerConfig, ThermalConfig
 from starhil.protocol.icd.conventions import NANOSECONDS
 
 MILLI: Final = 1e-3

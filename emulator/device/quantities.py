@@ -20,7 +20,7 @@ from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.reported import SEQUENCES
 from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.device.stored_images import BMP_TYPE, StoredImage, msdos_time
-from starhil.emulator.pipeline.messages import MatchedStar, Triple, as_triple
+from starhil.emulator.sensor.pipeline.messages import MatchedStar, Triple, as_triple
 from starhil.protocol.icd.conventions import DAY_NS, NANOSECONDS
 from starhil.protocol.icd.device_model import HEALTH, PARAMETER, QuantityModel, generic, number_in
 from starhil.protocol.icd.values import Parameter, Value

@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.pipeline.messages import Triple
+from starhil.emulator.sensor.pipeline.messages import Triple
+from starhil.emulator.simulation.clock import NANOSECONDS
 from starid.attitude import Attitude
 
 HISTORY: Final = 10

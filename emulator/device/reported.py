@@ -14,7 +14,7 @@ import numpy as np
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import ParameterValue
-from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple, as_quaternion, as_triple
+from starhil.emulator.sensor.pipeline.messages import ZERO, Quaternion, Triple, as_quaternion, as_triple
 from starhil.protocol.icd.conventions import Conventions
 from starid.arrays import Array
 from starid.attitude import Attitude

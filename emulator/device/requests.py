@@ -13,7 +13,7 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.snapshot import Snapshot
-from starhil.emulator.guard import log_internal_error
+from starhil.emulator.simulation.guard import log_internal_error
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.values import MessageError
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind

@@ -24,7 +24,7 @@ from typing import Any
 
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
-from starhil.emulator.signals import Signal
+from starhil.emulator.simulation.signal import Signal
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.messages import Reply
 

@@ -18,8 +18,8 @@ from starhil.emulator.device.parameters import ParameterState
 from starhil.emulator.device.power import FrameTiming, Phase, PowerModel, ThermalState
 from starhil.emulator.device.reported import Reported, reported
 from starhil.emulator.device.stored_images import FileState, ImageState, StoredImage
-from starhil.emulator.pipeline.messages import MatchedStar, Quaternion
-from starhil.emulator.profile_sections import DeviceConfig
+from starhil.emulator.profile.sections import DeviceConfig
+from starhil.emulator.sensor.pipeline.messages import MatchedStar, Quaternion
 from starhil.protocol.icd.codec import Field
 from starhil.protocol.icd.conventions import Conventions
 from starhil.protocol.icd.values import Parameter, Value

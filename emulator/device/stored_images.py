@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from starhil.emulator.pipeline.binning import mean_over_squares
+from starhil.emulator.sensor.pipeline.binning import mean_over_squares
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.image_transfer import FRAME_SIZE, HoleMap, file_checksum
 

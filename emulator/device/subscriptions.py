@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.parameters import Parameters
-from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.signals import Signals
+from starhil.emulator.simulation.clock import NANOSECONDS
+from starhil.emulator.simulation.scheduler import Event, Scheduler
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Row
 

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.power import ThermalModel
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
-from starhil.emulator.sky.radiation import particle_rate
-from starhil.emulator.sky.view import has_aberration
+from starhil.emulator.sensor.sky.radiation import particle_rate
+from starhil.emulator.sensor.sky.view import has_aberration
+from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.truth.orbit import Orbit
 from starhil.emulator.truth.source import TruthSource, TruthState
 

@@ -7,7 +7,7 @@ import socket
 from typing import Final
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.symlink_lock import InUseError, LockError, lock_name
+from starhil.emulator.links.name_lock import InUseError, LockError, lock_name
 
 log = logging.getLogger("starhil.link")
 

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import ClassVar, Final, TypeAlias
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.pending import PendingAnswer
@@ -20,7 +19,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import BusLink
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanDamage
-from starhil.emulator.pipeline.messages import ImageResult
+from starhil.emulator.sensor.pipeline.messages import ImageResult
+from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status

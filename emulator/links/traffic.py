@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, Final
 
 from starhil.emulator.links.base import Link
-from starhil.emulator.signals import Signal
+from starhil.emulator.simulation.signal import Signal
 from starhil.protocol.can.cubespace import REQUEST_KINDS, CanDeviceReceiver, CanHostReceiver, CanId
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError

@@ -9,8 +9,8 @@ from typing import Annotated, Generic, Protocol, TypeVar
 
 from pydantic import Field
 
-from starhil.emulator.clock import NANOSECONDS, Clock
-from starhil.emulator.device.scheduler import Scheduler
+from starhil.emulator.simulation.clock import NANOSECONDS, Clock
+from starhil.emulator.simulation.scheduler import Scheduler
 from starhil.emulator.truth.config import Strict
 
 Item = TypeVar("Item")

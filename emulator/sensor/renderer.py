@@ -17,10 +17,10 @@ from starhil.emulator.sensor.noise import digitize
 from starhil.emulator.sensor.particle_hits import add_cosmic_rays
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.rolling_shutter import at_row_times
-from starhil.emulator.sky.ephemeris import Observer
-from starhil.emulator.sky.light import AreaLight, AreaPainter
-from starhil.emulator.sky.light_grid import Backdrop
-from starhil.emulator.sky.objects import PointSource, SkyObjects
+from starhil.emulator.sensor.sky.ephemeris import Observer
+from starhil.emulator.sensor.sky.light import AreaLight, AreaPainter
+from starhil.emulator.sensor.sky.light_grid import Backdrop
+from starhil.emulator.sensor.sky.objects import PointSource, SkyObjects
 from starid.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask
 from starid.attitude import Attitude
 from starid.camera import Camera

@@ -9,9 +9,9 @@ from dataclasses import replace
 from typing import Final, Literal
 
 from starhil.emulator.errors import EmulatorError, explained
-from starhil.emulator.guard import until_cancelled
-from starhil.emulator.json_lines import read_lines
+from starhil.emulator.simulation.guard import until_cancelled
 from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError
+from starhil.emulator.truth.json_lines import read_lines
 from starhil.emulator.truth.live import RESTART_S, LiveTruth
 from starhil.protocol.errors import reason
 from starhil.protocol.transports.connections import ConnectionLimit

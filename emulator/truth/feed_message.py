@@ -29,8 +29,8 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from starhil.emulator.json_lines import JsonError, parse_object
 from starhil.emulator.truth.feed_rates import FeedError
+from starhil.emulator.truth.json_lines import JsonError, parse_object
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import MAX_RATE_DEG_S, Vector
 from starid.attitude import Attitude

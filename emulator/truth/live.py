@@ -30,7 +30,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from starhil.emulator.clock import MAX_SCALE
+from starhil.emulator.simulation.clock import MAX_SCALE
 from starhil.emulator.truth.feed_message import FeedMessage, JsonFormat
 from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError, FeedRates
 from starhil.emulator.truth.orbit import interpolate_orbit

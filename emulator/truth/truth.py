@@ -16,8 +16,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from starhil.emulator.clock import NANOSECONDS, Clock, make_clock
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.simulation.clock import NANOSECONDS, Clock, make_clock
 from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
 from starhil.emulator.truth.feed import LiveFeed, Step
 from starhil.emulator.truth.live import LiveTruth

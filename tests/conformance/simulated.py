@@ -8,24 +8,24 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import MemoryStore
-from starhil.emulator.endurance.simulated_loop import SimulatedLoop
+from starhil.emulator.launch.simulated_loop import SimulatedLoop
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialLink
-from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest
-from starhil.emulator.pipeline.messages import (
+from starhil.emulator.profile import Profile
+from starhil.emulator.run.pump import ClockPump
+from starhil.emulator.sensor.pipeline.imager import PipelineReply, PipelineRequest
+from starhil.emulator.sensor.pipeline.messages import (
     FrameResult,
     ImageRequest,
     ImageResult,
     MatchedStar,
     as_quaternion,
 )
-from starhil.emulator.profile import Profile
-from starhil.emulator.pump import ClockPump
+from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.truth.source import FixedTruth
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe

@@ -10,15 +10,15 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from starhil.emulator.clock import SteppedClock
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import MemoryStore, StateStore
 from starhil.emulator.launch import Emulator, RunOptions
-from starhil.emulator.pipeline import worker_process
-from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest
-from starhil.emulator.pipeline.messages import (
+from starhil.emulator.profile import Profile
+from starhil.emulator.sensor.pipeline import worker_process
+from starhil.emulator.sensor.pipeline.imager import PipelineReply, PipelineRequest
+from starhil.emulator.sensor.pipeline.messages import (
     FrameRequest,
     FrameResult,
     ImageRequest,
@@ -26,8 +26,8 @@ from starhil.emulator.pipeline.messages import (
     MatchedStar,
     Preview,
 )
-from starhil.emulator.pipeline.worker_process import WorkerProcess
-from starhil.emulator.profile import Profile
+from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
+from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.truth.source import FixedTruth, TruthSource
 from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
@@ -203,7 +203,7 @@ def make_bench() -> Callable[..., Bench]:
 def run(monkeypatch, make_bench):
     """Run a scenario with an emulation that is started and ready."""
     pipeline = make_bench().pipeline
-    monkeypatch.setattr("starhil.emulator.run.make_imager", lambda *_, **__: FakeImager(pipeline.handle))
+    monkeypatch.setattr("starhil.emulator.run.run.make_imager", lambda *_, **__: FakeImager(pipeline.handle))
 
     def run(scenario, *, clock="stepped", options=None, others=(), ready_within_s=60.0, **overrides):
         def profile(keys):

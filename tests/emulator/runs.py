@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from starhil.emulator.device.pending import PendingAnswer
-from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest, ReplyCallback
-from starhil.emulator.pipeline.messages import FrameRequest, IndexRequest, PipelineReady
-from starhil.emulator.signals import Signal
+from starhil.emulator.sensor.pipeline.imager import PipelineReply, PipelineRequest, ReplyCallback
+from starhil.emulator.sensor.pipeline.messages import FrameRequest, IndexRequest, PipelineReady
+from starhil.emulator.simulation.signal import Signal
 from starhil.protocol.messages import ErrorCode, Request
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}

@@ -12,8 +12,8 @@ import aiohttp
 import pytest
 
 from starhil.emulator.console import server
-from starhil.emulator.guard import log_loop_errors_once
 from starhil.emulator.launch import RunOptions
+from starhil.emulator.simulation.guard import log_loop_errors_once
 from starhil.protocol.transports.hub import CanHub
 from tests.emulator.console.pages import OPTIONS, WITHIN_S
 from tests.emulator.runs import Control

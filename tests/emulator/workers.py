@@ -4,7 +4,7 @@ from tests.emulator.runs import CAMERA
 
 WORKER = """
 import pickle, socket, sys
-from starhil.emulator.pipeline.messages import LENGTH, Failure, FrameResult, PipelineReady
+from starhil.emulator.sensor.pipeline.messages import LENGTH, Failure, FrameResult, PipelineReady
 link = socket.socket(fileno=int(sys.argv[1]))
 stream = link.makefile("rwb")
 def receive():

@@ -17,8 +17,9 @@ import numpy as np
 from starhil.emulator.cli.endurance import read_life
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.state_store import FileStore
+from starhil.emulator.launch.recording import read_run
+from starhil.emulator.launch.replay import EVENTS_FILE, RUN_FILE, read_events
 from starhil.emulator.profile import Profile, load_profile
-from starhil.emulator.replay import EVENTS_FILE, RUN_FILE, read_events, read_run
 from starhil.emulator.truth.ccsds_file import write_aem
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth.table import FileTruth, Span

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from starhil.emulator.cli.fmu_process import PACKET, _unpacked
+from starhil.emulator.cli.fmu.process import PACKET, _unpacked
 from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.truth.feed import LiveFeed, _Datagrams

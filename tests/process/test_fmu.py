@@ -461,7 +461,7 @@ def test_a_quaternion_in_the_wrong_sense_ends_the_step_with_the_reason(fmu3: Pat
 def test_without_a_compiler_the_export_says_what_is_missing(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr("starhil.emulator.fmu.export.shutil.which", lambda _name: None)
+    monkeypatch.setattr("starhil.emulator.cli.fmu.export.shutil.which", lambda _name: None)
     status, _, said = run_command_line("fmu", "export", "-o", str(tmp_path / "x.fmu"))
     assert status == 2
     assert said.splitlines() == [

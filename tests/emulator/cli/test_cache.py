@@ -23,7 +23,7 @@ RECORDS_SETUP = (
     + "text = f'{{setup.previews}} {{setup.sky}}'\nopen('{path}', 'w').write(text)\nsend({outcome})\n"
 )
 RECORDS_INDEX = """
-from starhil.emulator.pipeline.messages import IndexReady
+from starhil.emulator.sensor.pipeline.messages import IndexReady
 settings = receive().settings
 open({path!r}, "w").write(f"{{settings.limiting_magnitude}} {{settings.focal_length}} {{settings.centroid_x}}")
 send(IndexReady())

@@ -3,7 +3,7 @@
 import pytest
 
 from starhil.emulator.console.describe import fault_controls
-from starhil.emulator.faults import DeviceFault
+from starhil.emulator.run.faults import DeviceFault
 from starhil.protocol.unit import load_unit
 from tests.emulator.console.pages import ALONG_X, OPTIONS, Page
 

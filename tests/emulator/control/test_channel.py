@@ -11,9 +11,9 @@ import pytest
 
 import starhil.protocol.transports.can
 from starhil.emulator.control.channel import MAX_LINE
+from starhil.emulator.run.truth_log import COLUMNS
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.file import read_truth_file
-from starhil.emulator.truth_log import COLUMNS
 from tests.emulator.runs import Control, command
 
 REQUESTS = 10_000

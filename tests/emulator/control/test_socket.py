@@ -15,7 +15,7 @@ from starhil.emulator.control.socket import ControlSocket
 from starhil.emulator.control.token import check_token
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
-from starhil.emulator.symlink_lock import lock_name
+from starhil.emulator.links.name_lock import lock_name
 from tests.emulator.runs import Control
 
 

@@ -3,8 +3,8 @@
 import pytest
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.faults import FaultRequest, Faults
 from starhil.emulator.profile import Profile
+from starhil.emulator.run.faults import FaultRequest, Faults
 
 THRESHOLD_BIT = 22
 

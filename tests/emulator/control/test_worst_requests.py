@@ -12,7 +12,7 @@ from starhil.emulator.control import channel, scenario
 from starhil.emulator.control.channel import MAX_LINE
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
-from starhil.emulator.sky.objects import MAX_ROWS, SkyObjects
+from starhil.emulator.sensor.sky.objects import MAX_ROWS, SkyObjects
 from starhil.emulator.truth.config import MAX_SEGMENTS
 from starhil.emulator.truth.feed import MAX_LINES, LiveFeed, _Datagrams
 from starhil.emulator.truth.live import LiveTruth

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline.messages import Failure, FrameRequest, SolverSettings
-from starhil.emulator.pipeline.pipeline import Pipeline
-from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile, load_profile
+from starhil.emulator.profile.pipeline_setup import pipeline_setup
+from starhil.emulator.sensor.pipeline.messages import Failure, FrameRequest, SolverSettings
+from starhil.emulator.sensor.pipeline.pipeline import Pipeline
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starhil.protocol.files.bundled import bundled_units
 from starhil.protocol.icd.values import MessageError

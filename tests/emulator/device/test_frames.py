@@ -6,8 +6,8 @@ import pytest
 
 from starhil.emulator.device.cycle import MAX_PENDING
 from starhil.emulator.device.quantities import getter_of
-from starhil.emulator.pipeline.messages import Failure
 from starhil.emulator.profile import Profile
+from starhil.emulator.sensor.pipeline.messages import Failure
 from starhil.emulator.truth.source import FixedTruth
 from starhil.protocol.messages import ErrorCode
 from starid.attitude import Attitude

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from starhil.emulator.device.stored_images import StoredImage, msdos_time
-from starhil.emulator.pipeline.messages import Failure, ImageRequest, ImageResult
+from starhil.emulator.sensor.pipeline.messages import Failure, ImageRequest, ImageResult
 from starhil.protocol.messages import ErrorCode, ReplyKind, Request
 
 

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from starhil.emulator.clock import SteppedClock
 from starhil.emulator.device.file_download import LOOKUP_S
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.quantities import QUANTITIES, getter_of
@@ -20,6 +19,7 @@ from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.device.subscriptions import Subscription
 from starhil.emulator.links.canopen import DeviceApplication
 from starhil.emulator.profile import Profile
+from starhil.emulator.simulation.clock import SteppedClock
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.files.bundled import bundled_units
 from starhil.protocol.icd import InterfaceDefinition

@@ -10,7 +10,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
-from starhil.emulator.symlink_lock import LockError
+from starhil.emulator.links.name_lock import LockError
 from starhil.protocol.can.cubespace import CanId, MessageType, encode_request_frames
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import Request

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanDamage
 from starhil.emulator.links.canopen import (
@@ -21,6 +20,7 @@ from starhil.emulator.links.canopen import (
     open_canopen,
     rows_reporting,
 )
+from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.context import NmtState
 from starhil.protocol.canopen.storage import FileStorage, ParameterStorage

@@ -5,13 +5,13 @@ import random
 
 import pytest
 
-from starhil.emulator.clock import SteppedClock
-from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import JUNK_BYTES, SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
-from starhil.emulator.pipeline.messages import ImageRequest, ImageResult
+from starhil.emulator.sensor.pipeline.messages import ImageRequest, ImageResult
+from starhil.emulator.simulation.clock import SteppedClock
+from starhil.emulator.simulation.scheduler import Scheduler
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.storage import ParameterStorage, StorageError
 from starhil.protocol.errors import ProtocolError

@@ -5,13 +5,13 @@ import random
 
 import pytest
 
-from starhil.emulator.clock import SteppedClock
 from starhil.emulator.device.pending import PendingAnswer
-from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
+from starhil.emulator.simulation.clock import SteppedClock
+from starhil.emulator.simulation.scheduler import Scheduler
 from starhil.protocol.can.cubespace import CanHostReceiver, CanId, MessageType, encode_request_frames
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request

@@ -10,7 +10,7 @@ import pytest
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.dark_map import measure_dark_map
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
-from starhil.emulator.sky.objects import SkyObjects
+from starhil.emulator.sensor.sky.objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog

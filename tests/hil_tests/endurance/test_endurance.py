@@ -21,11 +21,11 @@ from starhil.emulator.device.counters import Counters
 from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.quantities import QUANTITIES
 from starhil.emulator.device.state_store import FileStore
-from starhil.emulator.endurance.unit_under_test import links_of
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.launch.replay import replay
+from starhil.emulator.launch.unit_in_memory import links_of
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
-from starhil.emulator.replay import replay
 from starhil.hil_tests.endurance.attitude_judge import Motion
 from starhil.hil_tests.endurance.life import UNRECORDED, Life, Outcome, make_life
 from starhil.hil_tests.endurance.oracle import Oracle

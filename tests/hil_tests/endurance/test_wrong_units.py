@@ -8,7 +8,7 @@ from itertools import count
 import pytest
 
 from starhil.emulator.cli.endurance import run_once
-from starhil.emulator.endurance.unit_under_test import UnitUnderTest
+from starhil.emulator.launch.unit_in_memory import UnitUnderTest
 from starhil.hil_tests.attitude import Quaternion, conjugate, from_rotation_vector, product
 from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge, Motion
 from starhil.hil_tests.endurance.life import Life

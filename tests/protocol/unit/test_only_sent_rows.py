@@ -8,7 +8,7 @@ import cantools
 import pytest
 
 from starhil.emulator.profile import Profile
-from starhil.emulator.run import _unit_of
+from starhil.emulator.run.run import _unit_of
 from starhil.protocol.errors import OneLineError
 from starhil.protocol.export import export, export_folder
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind

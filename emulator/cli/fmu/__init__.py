@@ -1,0 +1,52 @@
+"""`starhil fmu`: the star tracker as a Functional Mock-up Unit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from starhil.emulator.cli.options import ProfileArgument
+from starhil.emulator.cli.output import writing
+from starid.cli.output import output_help
+
+if TYPE_CHECKING:
+    from starhil.emulator.cli.fmu.variables import Fmi
+
+group = typer.Typer(help="Export the star tracker as a Functional Mock-up Unit (FMU).", no_args_is_help=True)
+
+
+@group.command()
+def export(
+    profile: ProfileArgument = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help=output_help("The FMU."))] = Path(
+        "startracker.fmu"
+    ),
+    fmi: Annotated[str, typer.Option(help="Version of FMI: 3 or 2, which older tools read.")] = "3",
+) -> None:
+    """Export an FMU for co-simulation, with its binary (Linux x86-64) and its source; this needs a C compiler.
+
+    Where it is simulated, `starhil` must be installed: the FMU starts it.
+    """
+    from typing import cast
+
+    from starhil.emulator.cli.fmu.export import export_fmu
+    from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
+    from starhil.hil_tests.rig.emulator_process import installed_command
+    from starid.cli.options import one_of
+
+    one_of("--fmi", fmi, ("2", "3"))
+    name = profile or DEFAULT_PROFILE
+    load_profile(name)
+    where = str(Path(name).absolute()) if name.endswith(".toml") else name
+    with writing(output):
+        export_fmu(output, where, installed_command(), cast("Fmi", fmi))
+
+
+@group.command(hidden=True)
+def serve() -> None:
+    """Run the emulator of an FMU, whose packets are on standard input."""
+    from starhil.emulator.cli.fmu.process import serve
+
+    serve()

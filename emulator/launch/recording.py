@@ -1,0 +1,106 @@
+"""The folder of a recording: what is copied into it, and read from it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import shutil
+from pathlib import Path
+from typing import Final, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from starhil.emulator.control.scenario import load_scenario
+from starhil.emulator.errors import EmulatorError, explained
+from starhil.emulator.profile import Profile
+from starhil.emulator.run.recorder import (
+    RUN_FILE,
+    SCENARIO_FILE,
+    STATE_FOLDER,
+)
+from starhil.emulator.truth.config import FileConfig
+from starhil.protocol.files.validation import problems
+from starid.storage.files import read_text
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+TRUTH_SOURCE_FILE: Final = "truth_source.csv"
+
+
+class _RunFile(BaseModel):
+    """The part of `run.json` that a replay uses."""
+
+    folder: str
+    profile: Profile
+    ends: bool = False
+    """Whether the tape of a complete run ends with the entry `end`: not if an older version recorded it."""
+
+
+def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
+    """Make the folder of a recording, with copies of all inputs of the run that may change later."""
+    failed, remedy = f"--record {folder}: cannot be used", "choose another folder"
+    with explained(failed, remedy):
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise EmulatorError(f"--record {folder}: not empty; {remedy}")
+    try:
+        with explained(failed, remedy):
+            _copy_inputs(folder, profile, scenario)
+    except EmulatorError:
+        shutil.rmtree(folder, ignore_errors=True)  # everything in it is from here
+        raise
+
+
+def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
+    values = profile.model_dump(mode="json")
+    # what the profile does not set is the unit's, which may have no dialects and another bit rate
+    values["links"]["serial"] = profile.links.serial.model_dump(mode="json", exclude_unset=True)
+    if isinstance(profile.truth, FileConfig):
+        shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
+        values["truth"]["path"] = TRUTH_SOURCE_FILE
+    state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
+    if state is not None:
+        values["run"]["state_dir"] = STATE_FOLDER
+    if state is not None and state.is_dir():
+        shutil.copytree(state, folder / STATE_FOLDER)
+    if scenario:
+        text = load_scenario(scenario).model_dump_json()
+        (folder / SCENARIO_FILE).write_text(text, encoding="utf-8")
+    run = {
+        "starhil": importlib.metadata.version("starhil"),
+        "folder": str(profile.folder.resolve()),
+        "profile": values,
+        "ends": True,
+    }
+    (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
+
+
+def read_run(folder: Path) -> tuple[Profile, bool]:
+    """Return the profile of a recording, and whether its tape ends with the entry `end`."""
+    path = folder / RUN_FILE
+    try:
+        text = read_recorded(path)
+    except EmulatorError as error:
+        raise EmulatorError(f"{error}; give a folder made by starhil run --record") from None
+    run = validated(_RunFile, text, path)
+    truth = run.profile.truth
+    if isinstance(truth, FileConfig):
+        truth = truth.model_copy(update={"path": str((folder / truth.path).absolute())})
+    profile = run.profile.model_copy(update={"truth": truth})
+    return profile.read_from(Path(run.folder) / RUN_FILE), run.ends
+
+
+def read_recorded(path: Path) -> str:
+    """Read a file of a recording; an error names it."""
+    with explained(f"replay {path}: cannot be read", errors=(OSError, UnicodeDecodeError)):
+        text = read_text(path)
+    return text  # noqa: RET504 (mypy expects that the block may be left without a result)
+
+
+def validated(model: type[Model], text: str | bytes, where: object) -> Model:
+    """Validate JSON of a recording; an error says where it is."""
+    try:
+        return model.model_validate_json(text)
+    except ValidationError as error:
+        raise EmulatorError(*(f"replay {where}: {problem}" for problem in problems(error, model))) from None

@@ -1,0 +1,430 @@
+"""Recordings of runs: preparing the folder, and replaying it on the stepped clock."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+from pydantic import Field, RootModel, model_validator
+
+from starhil.emulator.control.scenario import Scenario
+from starhil.emulator.device.device import Background, outcome
+from starhil.emulator.errors import EmulatorError, explained
+from starhil.emulator.launch.recording import read_recorded, read_run, validated
+from starhil.emulator.launch.replay_differences import difference_of_truth, difference_sent, units_sent
+from starhil.emulator.links.traffic import Decoder, WireItem
+from starhil.emulator.profile import Profile
+from starhil.emulator.run import Run
+from starhil.emulator.run.faults import FaultRequest
+from starhil.emulator.run.head import Head
+from starhil.emulator.run.recorder import (
+    EVENTS_FILE,
+    SCENARIO_FILE,
+    STATE_FOLDER,
+    TRUTH_FILE,
+    Done,
+    from_json,
+)
+from starhil.emulator.run.truth_log import TruthLog
+from starhil.emulator.run.wiring import Wiring
+from starhil.emulator.sensor.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
+from starhil.emulator.sensor.pipeline.messages import PipelineEnded, PipelineReady
+from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock
+from starhil.emulator.simulation.guard import call_guarded
+from starhil.emulator.truth.config import Strict, TruthConfig
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.transports.base import Transport
+from starhil.protocol.transports.paced import SerialTransport
+from starid.errors import StaridError
+from starid.storage.files import open_regular
+
+Item = TypeVar("Item", bytes, CanFrame)
+
+
+class _DeviationError(EmulatorError):
+    """The device behaves differently, so that the recording cannot be played further."""
+
+
+class _Timed(Strict, ABC):
+    """An entry of the tape."""
+
+    ns: Annotated[int, Field(ge=0, lt=1 << 63)]
+
+    @abstractmethod
+    async def play(self, on: _Playing) -> None:
+        """Play the entry at the current time; _DeviationError if the device behaves differently, so that this is impossible."""
+
+
+class _Event(_Timed):
+    """An event that was due."""
+
+    do: Literal["event"]
+
+    async def play(self, on: _Playing) -> None:
+        due = on.head.device.scheduler.pop_due(on.player.clock.now_ns())
+        if due is None:
+            raise _DeviationError("no event is due")
+        call_guarded("event", due.action, due.due_ns)
+
+
+class _Reply(_Timed):
+    """A reply of the pipeline, or what took its place because the pipeline had ended."""
+
+    do: Literal["reply"]
+    ended: str | None = None
+
+    async def play(self, on: _Playing) -> None:
+        await on.pipeline.deliver(None if self.ended is None else PipelineEnded(self.ended))
+
+
+class _PipelineState(_Timed):
+    """The pipeline was ready, also after a restart; it ended, or was given up."""
+
+    do: Literal["ready", "pipeline_lost", "pipeline_given_up"]
+
+    async def play(self, on: _Playing) -> None:
+        match self.do:
+            case "ready":
+                on.head.pipeline_ready(on.warm)
+            case "pipeline_lost":
+                on.head.device.pipeline_lost()
+            case "pipeline_given_up":
+                on.head.device.pipeline_given_up()
+
+
+class _Stored(_Timed):
+    """The end of a slow write."""
+
+    do: Literal["stored"]
+
+    async def play(self, on: _Playing) -> None:
+        if not on.player.writes:
+            raise _DeviationError("nothing is being written")
+        on.player.writes.popleft()()
+
+
+class _Item(_Timed):
+    """An item on a link."""
+
+    do: Literal["in", "out"]
+    link: Literal["serial", "can", "canopen"]
+    data: str | tuple[int, str, bool, bool]
+
+    @cached_property
+    def item(self) -> bytes | CanFrame:
+        """Serial bytes or a CAN frame."""
+        return from_json(self.data)
+
+    @model_validator(mode="after")
+    def _check_item(self) -> Self:
+        try:
+            is_serial = isinstance(self.item, bytes)
+        except ProtocolError as error:
+            raise ValueError(str(error)) from None
+        if is_serial != (self.link == "serial"):
+            raise ValueError(f"data: not that of the link {self.link}")
+        return self
+
+    async def play(self, on: _Playing) -> None:
+        receive = on.player.receivers.get(self.link)
+        if receive is None:
+            raise _DeviationError(f"the link {self.link} is off")
+        on.player.pass_item(self.link, self.item, outgoing=False)
+        receive(self.item)
+
+
+class _Feed(_Timed):
+    """A message of a simulator."""
+
+    do: Literal["feed"]
+    data: Annotated[str, Field(pattern=r"^[\x00-\xff]*$")]
+
+    async def play(self, on: _Playing) -> None:
+        if on.truth.feed is None:
+            raise _DeviationError("there is no live feed")
+        await on.truth.feed.process(self.data.encode("latin-1"))
+
+
+class _Truth(_Timed):
+    """A new truth."""
+
+    do: Literal["truth"]
+    config: TruthConfig
+    start_s: Annotated[float, Field(ge=-1e9, le=1e9)]
+
+    async def play(self, on: _Playing) -> None:
+        await on.truth.set(self.config, self.start_s)
+
+
+class _Fault(_Timed):
+    """New faults."""
+
+    do: Literal["fault"]
+    request: FaultRequest
+
+    async def play(self, on: _Playing) -> None:
+        on.head.faults.inject(self.request)
+
+
+class _ClearFaults(_Timed):
+    """The end of all faults."""
+
+    do: Literal["clear_faults"]
+
+    async def play(self, on: _Playing) -> None:
+        on.head.faults.clear()
+
+
+class _End(_Timed):
+    """The end of the run."""
+
+    do: Literal["end"]
+
+    async def play(self, on: _Playing) -> None:
+        on.ended = True
+
+
+Entry = _Event | _Reply | _PipelineState | _Stored | _Item | _Feed | _Truth | _Fault | _ClearFaults | _End
+
+
+class _Line(RootModel[Annotated[Entry, Field(discriminator="do")]]):
+    """A line of the tape."""
+
+
+class Player(Wiring):
+    """Connects a run to a recording instead of the world.
+
+    `ends_at_once`: whether slow writes ended at once in the recorded run, as on the stepped clock.
+    """
+
+    plays = repeatable = True
+
+    def __init__(self, *, ends_at_once: bool) -> None:
+        self.stepped = SteppedClock()
+        super().__init__(self.stepped)
+        self.passed: list[WireItem] = []
+        """Items that the device has received and sent."""
+        self.receivers: dict[str, Callable[[Any], None]] = {}
+        """Function of each open link that takes its input."""
+        self.pipeline: PlayedImager | None = None
+        self.writes: deque[Callable[[], None]] = deque()
+        """Functions that end pending slow writes."""
+        self._ends_at_once = ends_at_once
+
+    def serial(self, name: str, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (nothing is opened)
+        """Return a serial line that is connected to the tape."""
+        return _PlayedSerial(name, self)
+
+    def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002
+        """Return a CAN bus that is connected to the tape."""
+        return _PlayedTransport(name, self)
+
+    def pass_item(self, link: str, item: bytes | CanFrame, *, outgoing: bool) -> None:
+        """Keep an item that passes a link now, for the comparison."""
+        self.passed.append(WireItem(self.stepped.now_ns() / NANOSECONDS, link, outgoing, item))
+
+    def imager(self, inner: Imager) -> Imager:
+        """Return a pipeline whose replies wait for their entries."""
+        self.pipeline = PlayedImager(inner)
+        return self.pipeline
+
+    def background(self, inner: Background) -> Background:
+        """Return a function that runs slow writes at once; their end waits for its entry."""
+        if self._ends_at_once:
+            return inner
+
+        def background(work: Callable[[], None], done: Done) -> None:
+            error = outcome(work)
+            self.writes.append(lambda: done(error))
+
+        return background
+
+
+class _PlayedTransport(Transport[Item]):
+    """A port or bus that is connected to the tape."""
+
+    immediate = True
+
+    def __init__(self, name: str, player: Player) -> None:
+        super().__init__(f"virtual:{name}")  # a bus that no other process can join
+        self._name = name
+        self._player = player
+
+    async def _open(self) -> None:
+        self._player.receivers[self._name] = self._receive
+
+    def send(self, item: Item) -> bool:
+        self._player.pass_item(self._name, item, outgoing=True)
+        return True
+
+    async def close(self) -> None:
+        self._player.receivers.pop(self._name, None)
+
+
+class _PlayedSerial(_PlayedTransport[bytes], SerialTransport):
+    """A serial line that is connected to the tape."""
+
+    def set_baud(self, baud: int) -> None:
+        """Take the bytes at any bit rate: they have their times on the tape."""
+
+
+class PlayedImager:
+    """A pipeline whose replies wait for their entries."""
+
+    def __init__(self, inner: Imager) -> None:
+        self._inner = inner
+        self._arrived: deque[tuple[ReplyCallback, PipelineReply]] = deque()
+        self.pending = 0
+
+    def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
+        """Pass a request to the pipeline."""
+
+        def arrived(reply: PipelineReply) -> None:
+            self._arrived.append((done, reply))
+
+        self.pending += 1
+        self._inner.submit(request, arrived)
+
+    async def settle(self) -> None:
+        """Wait until the pipeline is idle."""
+        await self._inner.settle()
+
+    async def deliver(self, ended: PipelineEnded | None) -> None:
+        """Deliver the next reply, or `ended` in its place; _DeviationError if the device has sent fewer requests than in the recorded run."""
+        if not self._arrived:
+            await self._inner.settle()
+        if not self._arrived:
+            raise _DeviationError("it requests fewer frames than in the recorded run")
+        self.pending -= 1
+        done, reply = self._arrived.popleft()
+        done(ended or reply)
+
+
+@dataclass
+class ReplayReport:
+    """Outcome of a replay."""
+
+    entries: int = 0
+    sent: dict[str, int] = field(default_factory=dict)
+    """Number of serial bytes or CAN frames sent, by link."""
+    differences: list[str] = field(default_factory=list)
+    """One line for each link or file that differs, is missing or is truncated; empty if all are identical."""
+
+
+def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
+    """Yield the entries of a tape, whose times do not decrease, each with file and line."""
+    path = folder / EVENTS_FILE
+    last_ns = 0
+    with explained(f"replay {path}: cannot be read"), open_regular(path) as file:
+        for number, line in enumerate(file, start=1):
+            if not line.endswith(b"\n"):
+                return  # the run was killed while it wrote
+            where = f"{path}: line {number}"
+            entry = validated(_Line, line, where).root
+            if entry.ns < last_ns:
+                why = f"time {entry.ns} ns is before that of the entry above, {last_ns} ns; the recording is damaged"
+                raise EmulatorError(f"replay {where}: {why}")
+            last_ns = entry.ns
+            yield where, entry
+
+
+async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
+    """Play a recording on the stepped clock, and compare sent items and measurements with it.
+
+    The device may have another profile than the recorded one; `run` except the algorithm, and `links`, are as
+    recorded.
+    """
+    recorded, ends = read_run(folder)
+    player = Player(ends_at_once=recorded.run.clock == "stepped")
+    report = ReplayReport()
+    with tempfile.TemporaryDirectory(prefix="starhil-replay-") as scratch:
+        state = ""
+        if recorded.run.state_dir:
+            state = str(Path(scratch) / STATE_FOLDER)
+            if (folder / STATE_FOLDER).is_dir():
+                shutil.copytree(folder / STATE_FOLDER, state)
+        truth_log = Path(scratch) / TRUTH_FILE
+        links = recorded.links.model_copy(
+            update={"serial": recorded.links.serial.model_copy(update={"symlink": ""})}
+        )
+        played = recorded if profile is None else profile
+        run = recorded.run.model_copy(update={"state_dir": state, "algorithm": played.run.algorithm})
+        again = Run([played.model_copy(update={"links": links, "run": run})], player)
+        log = TruthLog(truth_log, wall_times=False)
+        try:
+            await again.open()
+            (head,) = again.heads
+            head.device.signals.frame_published.connect(log.write)
+            if (folder / SCENARIO_FILE).exists():
+                text = read_recorded(folder / SCENARIO_FILE)
+                scenario = validated(Scenario, text, folder / SCENARIO_FILE)
+                head.device.scheduler.add(scenario.prepare(head, again.truth))
+            pipeline = player.pipeline
+            if pipeline is None:
+                raise EmulatorError("replay: the run has no pipeline")
+            play = _Playing(again, head, player, pipeline, await head.imager.start())
+            recording = await play.entries(folder, report, ends=ends)
+            to_the_end = not report.differences
+            new_decoder = partial(Decoder, head.icd, head.serial_dialect)
+            for link in sorted({each.bus for each in recording} | set(player.receivers)):
+                before, now = (
+                    [each for each in items if each.bus == link] for items in (recording, player.passed)
+                )
+                report.sent[link] = len(list(units_sent(before)))
+                if difference := difference_sent(before, now, new_decoder, to_the_end=to_the_end):
+                    report.differences.append(f"{link}: {difference}")
+        finally:
+            await again.close()
+            log.close()
+        if difference := difference_of_truth(folder / TRUTH_FILE, truth_log, to_the_end=to_the_end):
+            report.differences.append(difference)
+    return report
+
+
+class _Playing:
+    """Plays entries one by one."""
+
+    def __init__(
+        self, run: Run, head: Head, player: Player, pipeline: PlayedImager, warm: PipelineReady
+    ) -> None:
+        self.truth = run.truth
+        self.head = head
+        self.player = player
+        self.pipeline = pipeline
+        self.warm = warm
+        self.ended = False
+        """Whether the entry `end` was played."""
+
+    async def entries(self, folder: Path, report: ReplayReport, *, ends: bool) -> list[WireItem]:
+        """Play a tape to its end, or to the entry at which the device deviates; return what passed the links until there."""
+        recording: list[WireItem] = []
+        stepped = self.player.stepped
+        for where, entry in read_events(folder):
+            if isinstance(entry, _Item):
+                outgoing = entry.do == "out"
+                recording.append(WireItem(entry.ns / NANOSECONDS, entry.link, outgoing, entry.item))
+                if outgoing:
+                    continue
+            stepped.set_ns(entry.ns)
+            try:
+                await entry.play(self)
+            except _DeviationError as deviation:
+                at = f"at {entry.ns / NANOSECONDS:.6f} s the device behaves differently"
+                report.differences.append(f"{where}: {at}: {deviation}")
+                return recording
+            except (EmulatorError, ProtocolError, StaridError) as error:
+                raise EmulatorError(f"replay {where}: {error}") from None
+            report.entries += not self.ended
+        if ends and not self.ended:
+            report.differences.append(
+                f"{folder / EVENTS_FILE}: truncated at {stepped.now_ns() / NANOSECONDS:.6f} s: the run was killed, or lines are missing"
+            )
+        return recording

@@ -1,0 +1,334 @@
+"""A unit that runs in memory on the stepped clock: power, surroundings and the device's end of its links."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import resource
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Final, TypeVar
+
+from pydantic import TypeAdapter
+
+from starhil.emulator.device.measurement import Measurement
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.launch.emulator import Emulator, RunOptions
+from starhil.emulator.launch.simulated_loop import WORKER_WAIT_S
+from starhil.emulator.profile import Profile
+from starhil.emulator.run import Run
+from starhil.emulator.run.faults import FaultRequest
+from starhil.emulator.run.head import Head
+from starhil.emulator.run.pump import MAX_STEP_S
+from starhil.emulator.run.wiring import Wiring
+from starhil.emulator.sensor.pipeline.error_model import ErrorModelImager
+from starhil.emulator.sensor.pipeline.imager import WorkerImager
+from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
+from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock
+from starhil.emulator.truth.config import TruthConfig
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.transports.base import Transport
+from starhil.protocol.transports.paced import SerialTransport
+
+Item = TypeVar("Item", bytes, CanFrame)
+
+QUEUE_LIMIT: Final = 5000
+DESCRIPTOR_LIMIT: Final = 4
+MEMORY_LIMIT_BYTES: Final = 64 * 2**20
+"""A life may queue so many events, and add so many descriptors and bytes to those in use after its first power-on."""
+STATE_FOLDER: Final = "state"
+LONGEST_START_S: Final = 120.0
+"""Longest wall time for which a killed pipeline may take to be missed, or to be ready again, seconds."""
+TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
+
+
+class MemoryTransport(Transport[Item]):
+    """The device's end of a link without a wire."""
+
+    immediate: ClassVar[bool] = True
+
+    def __init__(self, description: str, now_s: Callable[[], float]) -> None:
+        super().__init__(description)
+        self._now_s = now_s
+        self.sent: list[tuple[float, Item]] = []
+        """Items that the device has sent and nobody has taken, each with its time, seconds."""
+        self.reads = True
+        """Whether the peer reads; otherwise what the device sends is dropped, as on a pty without a reader."""
+
+    async def _open(self) -> None:
+        """Do nothing: there is no port."""
+
+    def send(self, item: Item) -> bool:
+        """Keep an item for the peer."""
+        count = len(item) if isinstance(item, bytes) else 1
+        if not self.reads:
+            self.statistics.dropped += count
+            return False
+        self.statistics.sent += count
+        self.sent.append((self._now_s(), item))
+        return True
+
+    def deliver(self, item: Item) -> None:
+        """Pass an item to the device."""
+        self._receive(item)
+
+    async def drain(self) -> None:
+        """Return at once: nothing waits."""
+
+    async def close(self) -> None:
+        """Do nothing: there is no port."""
+
+
+class MemorySerial(MemoryTransport[bytes], SerialTransport):
+    """The device's end of a serial line."""
+
+    def set_baud(self, baud: int) -> None:
+        """Do nothing: bytes take no time."""
+
+
+class MemoryWiring(Wiring):
+    """Connects a run to transports in memory."""
+
+    repeatable = True
+
+    def __init__(self, port: MemorySerial, buses: Mapping[str, MemoryTransport[CanFrame]]) -> None:
+        super().__init__(SteppedClock())
+        self._port = port
+        self._buses = buses
+
+    def serial(self, name: str, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (no port is opened)
+        """Return the serial line."""
+        return self._port
+
+    def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002 (no bus is opened)
+        """Return a CAN bus."""
+        return self._buses[name]
+
+
+class _InternalErrors(logging.Handler):
+    """Collects what the emulator logs as internal errors."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a message."""
+        self.texts.append(record.getMessage())
+
+
+class UnitUnderTest:
+    """An emulated unit in memory, with the open links and the keys of a profile.
+
+    The folder of its state is best in memory too (tmpfs). Images are `rendered` and solved in a process; otherwise
+    the pipeline is an error model. `record` is the folder of a recording of the time since power was last switched
+    on.
+    """
+
+    def __init__(
+        self,
+        icd: InterfaceDefinition,
+        unit: str,
+        links: tuple[str, ...],
+        profile: Mapping[str, Any],
+        seed: int,
+        folder: Path,
+        *,
+        rendered: bool = False,
+        record: Path | None = None,
+    ) -> None:
+        self.links = links
+        run = {
+            **profile.get("run", {}),
+            "seed": seed,
+            "clock": "stepped",
+            "worker": "process" if rendered else "error_model",
+            "state_dir": str(folder.resolve() / STATE_FOLDER),
+        }
+        channels: dict[str, Any] = {
+            "serial": {"port": "auto" if "serial" in links else "off"},
+            "can": {"channel": "auto" if "can" in links or icd.canopen_only else "off"},
+            "canopen": {
+                "node": int(icd.device_parameters["canopen_node"].default) if "canopen" in links else 0
+            },
+        }
+        self.profile = Profile.model_validate({**profile, "unit": unit, "run": run, "links": channels})
+        self._folder = folder
+        self._record = record
+        self._emulator: Emulator | None = None
+        self.frames = 0
+        self.exposed_s = 0.0
+        """Number of images solved in all, and the sum of their periods, seconds."""
+        self._unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+        self._transports: dict[str, MemoryTransport[Any]] = {}
+        self._first: tuple[int, int] | None = None
+        """Descriptors and memory, bytes, in use when power was first on."""
+        self._errors = _InternalErrors()
+        logging.getLogger("starhil.internal").addHandler(self._errors)
+
+    @property
+    def run(self) -> Run:
+        """The run; power must be on."""
+        if self._emulator is None:
+            raise EmulatorError("endurance: power is off")
+        return self._emulator.run
+
+    @property
+    def head(self) -> Head:
+        """The head of the run; power must be on."""
+        return self.run.heads[0]
+
+    # --- power ---
+
+    async def power_on(self) -> None:
+        """Switch the unit on and wait until the emulator is ready; simulation time begins at zero."""
+        reads = {name: transport.reads for name, transport in self._transports.items()}
+        self._emulator = None
+        port = MemorySerial("serial", self._time_s)
+        buses: dict[str, MemoryTransport[CanFrame]] = {
+            name: MemoryTransport(f"virtual:{name}", self._time_s) for name in ("can", "canopen")
+        }
+        self._transports = {"serial": port, **buses}
+        for name, transport in self._transports.items():
+            transport.reads = reads.get(name, True)
+        if self._record is not None:
+            shutil.rmtree(self._record, ignore_errors=True)
+        options = RunOptions(record=self._record)
+        self._emulator = Emulator([self.profile], options, wiring=MemoryWiring(port, buses))
+        await self._emulator.start()
+        self.head.device.signals.frame_published.connect(self._count_frame)
+        await self._emulator.ready()
+        self._first = self._first or (self.open_descriptors(), self.memory_bytes())
+
+    async def power_off(self, *, factory: bool = False) -> None:
+        """Switch the unit off; `factory` deletes its stored state."""
+        if self._emulator is not None:
+            await self._emulator.close()
+        if factory:
+            shutil.rmtree(self._folder / STATE_FOLDER, ignore_errors=True)
+
+    # --- time and links ---
+
+    @property
+    def now_s(self) -> float:
+        """Simulation time since power was switched on, seconds."""
+        return self.run.clock.now_ns() / NANOSECONDS
+
+    def _time_s(self) -> float:
+        """Return the simulation time; it is zero while the run is being opened."""
+        return 0.0 if self._emulator is None else self.now_s
+
+    def _count_frame(self, measurement: Measurement) -> None:
+        self.frames += 1
+        self.exposed_s += measurement.period_s
+
+    async def step(self, seconds: float, *, most: int | None = None) -> None:
+        """Let simulation time pass, and the same time of the event loop; end early after about `most` events in the unit."""
+        stepper = self.run.stepper
+        if stepper is None:
+            raise EmulatorError("endurance: the clock is not stepped")
+        left, chunk, done = seconds, seconds if most is None else 1.0, 0
+        while left > 0.0:
+            chunk = min(left, chunk, MAX_STEP_S)
+            done += await stepper.step(chunk)
+            await asyncio.sleep(chunk)
+            left -= chunk
+            if most is not None and done >= most:
+                break
+            chunk *= 2.0 if most is None or done < most // 4 else 1.0
+
+    def deliver(self, link: str, item: bytes | CanFrame) -> None:
+        """Pass bytes or a frame to the device."""
+        self._transports[link].deliver(item)
+
+    def take(self, link: str) -> list[tuple[float, Any]]:
+        """Return what the device has sent on a link since the last call, each item with its time, seconds."""
+        sent = self._transports[link].sent
+        taken = list(sent)
+        sent.clear()
+        return taken
+
+    # --- surroundings ---
+
+    async def set_truth(self, truth: Mapping[str, Any]) -> None:
+        """Replace the truth by a table as `[truth]` in a profile."""
+        await self.run.truth.set(TRUTH.validate_python(dict(truth)))
+
+    def fault(self, fault: Mapping[str, Any]) -> None:
+        """Inject faults, a request as on the control channel."""
+        request = FaultRequest.model_validate(dict(fault))
+        self.run.record("fault", request=request.model_dump(mode="json"))
+        self.head.faults.inject(request)
+
+    def clear_faults(self) -> None:
+        """End all faults."""
+        self.run.record("clear_faults")
+        self.head.faults.clear()
+
+    async def end_pipeline(self) -> None:
+        """End the image pipeline; a process is killed, and its successor awaited, which takes no simulation time."""
+        imager, device = self.head.imager, self.head.device
+        if isinstance(imager, ErrorModelImager):
+            imager.end("pipeline: ended by an endurance run")
+            return
+        if not isinstance(imager, WorkerImager) or not isinstance(imager.worker, WorkerProcess):
+            raise EmulatorError("endurance: the pipeline is in a thread, which cannot be ended")
+        imager.worker.process.kill()
+        for ready in (False, True):
+            until_s = time.monotonic() + LONGEST_START_S
+            while device.warm is not ready:
+                if time.monotonic() > until_s:
+                    raise EmulatorError("endurance: the pipeline has not been restarted")
+                await asyncio.sleep(WORKER_WAIT_S)
+                time.sleep(WORKER_WAIT_S)
+
+    def set_disk(self, *, full: bool) -> None:
+        """Set whether this process can write to files; by the kernel, so that it concerns every writer."""
+        _, hard = self._unlimited
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard) if full else self._unlimited)
+
+    def set_peer(self, link: str, *, reads: bool) -> None:
+        """Set whether the peer of a link reads."""
+        self._transports[link].reads = reads
+
+    # --- what the bus does not show ---
+
+    def defect(self) -> str:
+        """Return an internal error that was logged, or what has grown since power was first switched on; empty if nothing."""
+        if self._errors.texts:
+            return f"internal error: {self._errors.texts[0]}"
+        if (queued := self.queued_events()) > QUEUE_LIMIT:
+            return f"{queued} events are queued"
+        descriptors, memory_bytes = self._first or (0, 0)
+        if (found := self.open_descriptors()) > descriptors + DESCRIPTOR_LIMIT:
+            return f"{found} descriptors are open, {descriptors} at the start"
+        added = self.memory_bytes() - memory_bytes
+        return f"{added >> 20} MiB of memory more than at the start" if added > MEMORY_LIMIT_BYTES else ""
+
+    def open_descriptors(self) -> int:
+        """Return the number of open file descriptors of this process."""
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    def queued_events(self) -> int:
+        """Return the number of events in the queue of the device."""
+        return self.head.device.scheduler.count
+
+    def memory_bytes(self) -> int:
+        """Return the resident memory of this process."""
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return pages * resource.getpagesize()
+
+    def dispose(self) -> None:
+        """Remove the log handler and the limit of files."""
+        logging.getLogger("starhil.internal").removeHandler(self._errors)
+        self.set_disk(full=False)
+
+
+def links_of(icd: InterfaceDefinition) -> tuple[str, ...]:
+    """Return the names of a unit's links."""
+    there = {"serial": icd.link.serial is not None, "can": icd.link.can is not None}
+    there["canopen"] = icd.canopen is not None
+    return tuple(name for name, present in there.items() if present)

@@ -1,0 +1,48 @@
+"""The image pipeline of a profile."""
+
+from __future__ import annotations
+
+from typing import TypeAlias
+
+from starhil.emulator.profile.profile import Profile
+from starhil.emulator.sensor.pipeline.error_model import ErrorModelImager
+from starhil.emulator.sensor.pipeline.imager import WorkerImager
+from starhil.emulator.sensor.pipeline.messages import PipelineSetup
+from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess, WorkerThread
+
+PipelineImager: TypeAlias = WorkerImager | ErrorModelImager
+"""An image pipeline that can be started, and started again after an unexpected end."""
+
+
+def make_imager(
+    profile: Profile, worker: WorkerProcess | None, *, repeatable: bool, previews: bool
+) -> PipelineImager:
+    """Return the pipeline of a profile; a worker that was started earlier is used, or ended."""
+    setup = pipeline_setup(profile, repeatable=repeatable, previews=previews)
+    if profile.run.worker == "process":
+        return WorkerImager(setup, worker or WorkerProcess())
+    if worker is not None:
+        worker.end()
+    if profile.run.worker == "error_model":
+        return ErrorModelImager(setup)
+    return WorkerImager(setup, WorkerThread())
+
+
+def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool = False) -> PipelineSetup:
+    """Return the pipeline configuration of a profile; `repeatable`: results independent of machine speed."""
+    path = profile.catalog.path
+    return PipelineSetup(
+        camera=profile.camera.values(),
+        sensor=dict(profile.sensor),
+        sky=dict(profile.sky),
+        identifier=dict(profile.identifier),
+        catalog_path=str(profile.folder / path) if path else "",
+        epoch=profile.epoch,
+        algorithm=profile.run.algorithm,
+        seed=profile.run.seed,
+        build_in_background=profile.run.clock != "stepped" and not repeatable,
+        previews=previews,
+        dark_frames=profile.device.dark_frames,
+        calibration=profile.calibration.matrix(),
+        images=profile.images.resolved(profile.folder),
+    )

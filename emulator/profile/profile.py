@@ -1,0 +1,422 @@
+"""Device profiles: TOML files that configure camera, sensor, truth, links and parameters of a run.
+
+A profile may extend another (`extends = "ideal"`, or a path relative to the file) and override its keys. Every key
+is validated; an error names the file, the key and the remedy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import permutations
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Self
+
+from pydantic import (
+    Field,
+    PrivateAttr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile.sections import (
+    CalibrationConfig,
+    CameraConfig,
+    CatalogConfig,
+    DeviceConfig,
+    ImagesConfig,
+    LinksConfig,
+    PowerConfig,
+    RadiationConfig,
+    RunConfig,
+    ThermalConfig,
+    TimingConfig,
+)
+from starhil.emulator.profile.toml_file import find_toml, read_toml
+from starhil.emulator.truth.config import (
+    FixedConfig,
+    OrbitConfig,
+    Strict,
+    TruthConfig,
+    UserPath,
+)
+from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError, remedy
+from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled_units, find, not_found
+from starhil.protocol.files.user_file import TomlError, parse_toml
+from starhil.protocol.files.validation import problems
+from starhil.protocol.unit import load_unit
+from starid.catalog.earth import unix_time
+
+if TYPE_CHECKING:
+    from starhil.protocol.icd.values import Parameter
+    from starid.camera import Camera
+
+DEFAULT_PROFILE: Final = "cubestar"
+MAX_EXTENDS_DEPTH: Final = 8
+
+_J2000_UNIX_S: Final = 946_728_000.0
+_JULIAN_YEAR_S: Final = 365.25 * 86_400.0
+
+Layer = tuple[str, Mapping[str, Any]]
+"""A source of keys, a profile's file or an option `--set`, and its tables."""
+
+
+class Profile(Strict):
+    """A device profile."""
+
+    name: str = "ideal"
+    """Name in messages and on the control channel."""
+    unit: UserPath = DEFAULT_UNIT
+    """Interface definition: name of a bundled unit, or a folder relative to the profile."""
+    run: RunConfig = RunConfig()
+    """Seed, clock, algorithm, files."""
+    catalog: CatalogConfig = CatalogConfig()
+    """Stars."""
+    camera: CameraConfig = CameraConfig()
+    """Optics and pixel array."""
+    sensor: dict[str, Any] = Field(default_factory=dict)
+    """Fields of `starhil.emulator.sensor.model.SensorModel`, except those that are device parameters."""
+    sky: dict[str, Any] = Field(default_factory=dict)
+    """Date and bodies (`starhil.emulator.sensor.sky.view.Sky`), and fields of
+    `starhil.emulator.sensor.sky.objects.SkyObjects`."""
+    identifier: dict[str, Any] = Field(default_factory=dict)
+    """Options of the star identification algorithm."""
+    truth: TruthConfig = FixedConfig(kind="fixed")
+    """True attitude of the sensor."""
+    orbit: OrbitConfig | None = None
+    """True orbit of the spacecraft. Without it, the sensor is at the Earth's centre and does not see it."""
+    images: ImagesConfig = ImagesConfig()
+    """Images from a folder or a camera."""
+    device: DeviceConfig = DeviceConfig()
+    """Identification and boot."""
+    timing: TimingConfig = TimingConfig()
+    """Modelled processing times."""
+    power: PowerConfig = PowerConfig()
+    """Currents by phase."""
+    thermal: ThermalConfig = ThermalConfig()
+    """Temperature."""
+    radiation: RadiationConfig = RadiationConfig()
+    """Particles along the orbit."""
+    links: LinksConfig = LinksConfig()
+    """Serial line, CAN and CANopen."""
+    calibration: CalibrationConfig = CalibrationConfig()
+    """Known errors of the calibrated camera, as `starid calibrate` writes them. They increase the uncertainty that the
+    unit states, and change nothing else. Other keys are notes."""
+    health: dict[str, float] = Field(default_factory=dict)
+    """Numbers reported as the quantities `health.NAME`, such as temperatures, in the unit of the field.
+    Default: in °C, V, A or W what `[thermal]` and `[power]` give, otherwise 0."""
+    parameters: dict[str, Any] = Field(default_factory=dict)
+    """Defaults of device parameters, named as in the interface definition."""
+
+    _source: Path | None = PrivateAttr(default=None)
+    _layers: tuple[Layer, ...] = PrivateAttr(default=())
+
+    @field_validator("sky")
+    @classmethod
+    def _check_date(cls, sky: dict[str, Any]) -> dict[str, Any]:
+        try:
+            return {**sky, "date": unix_time(sky["date"])} if "date" in sky else sky
+        except ValueError as error:
+            raise ValueError(f"date: {error}") from None
+
+    @model_validator(mode="after")
+    def _some_use_of_images(self) -> Self:
+        if self.images.used and self.run.worker == "error_model":
+            raise ValueError('images: run.worker = "error_model" uses no images; choose process or thread')
+        return self
+
+    @property
+    def start_unix_s(self) -> float:
+        """Date of the sky, the orbit and the bodies at the start of the run, as Unix time."""
+        return float(self.sky.get("date", self.run.start_unix_s))
+
+    @property
+    def epoch(self) -> float:
+        """Julian year of the star positions."""
+        if self.catalog.epoch is not None:
+            return self.catalog.epoch
+        return round(2000.0 + (self.start_unix_s - _J2000_UNIX_S) / _JULIAN_YEAR_S, 1)
+
+    def read_from(self, path: Path, layers: Sequence[Layer] = ()) -> Self:
+        """Note the file of the profile, to whose folder its relative paths refer, and all its layers; return the profile."""
+        self._source = path
+        self._layers = tuple(layers)
+        return self
+
+    def source_of(self, error: object) -> str:
+        """Return the source of the key with which an error begins: an option `--set`, or a file."""
+        location = str(error).partition(": ")[0].split(".")
+        return _source_of(self._layers, location) or f"profile {self.source}"
+
+    @property
+    def source(self) -> str:
+        """File of the profile, or its name if there is none, for messages."""
+        return self.name if self._source is None else str(self._source)
+
+    @property
+    def unit_source(self) -> str:
+        """The unit for `load_unit`: name of a bundled unit, or a folder relative to the profile."""
+        if self.unit in bundled_units():
+            return self.unit
+        return str(self.folder / self.unit)
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the profile, to which its relative paths refer."""
+        return Path() if self._source is None else self._source.parent
+
+
+ALTERNATIVES: Final = (
+    (frozenset({"fov_deg"}), frozenset({"focal_px", "centre_px"})),
+    (frozenset({"ra_deg", "dec_deg", "roll_deg"}), frozenset({"quaternion_xyzw"})),
+    (frozenset({"quaternion_xyzw"}), frozenset({"matrix"}), frozenset({"euler_deg", "sequence"})),
+)
+"""Sets of keys that exclude each other in a table: field of view, attitude, mount."""
+
+CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"})
+"""Device parameters that describe the camera; by default, the device is calibrated exactly."""
+
+OF_CAMERA: Final = CALIBRATION | {"limiting_magnitude"}
+"""Device parameters that are not inherited by a profile with another camera."""
+
+PATHS: Final = frozenset(
+    {"truth.path", "orbit.path", "catalog.path", "images.folder", "images.dark", "run.state_dir"}
+)
+"""Keys of files and folders, which refer to the folder of the profile that has them."""
+
+_A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
+OF_FAULTS: Final = dict.fromkeys(
+    ("fault", "faults", "optical", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
+     "delay_s", "split", "gap_s"),
+    _A_FAULT,
+)  # fmt: skip
+"""Keys of faults, which a profile does not have, and the hint for whoever writes one there."""
+OF_ATTITUDES: Final = {
+    key: f"; did you mean attitude.{key}?" for key in ("ra_deg", "dec_deg", "roll_deg", "quaternion_xyzw")
+}
+"""Keys of an attitude, and the hint for whoever writes one outside its table."""
+
+
+def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> Profile:
+    """Read a profile and the profiles it extends, and apply `section.key=value` overrides.
+
+    Raises EmulatorError: each problem names file or option, key and remedy.
+    """
+    path = find_toml("profile", name_or_path)
+    layers = _read_extended(path, 0)
+    values: dict[str, Any] = {}
+    for _, table in layers:
+        if "camera" in table:
+            _drop_parameters_of_camera(values)
+        values = merge(values, table)
+    if any(override.startswith("camera.") for override in overrides):
+        _drop_parameters_of_camera(values)
+    layers += [_apply_override(values, override) for override in overrides]
+    found: list[tuple[Sequence[object], str]] = []
+    profile = None
+    try:
+        profile = Profile.model_validate(values)
+    except ValidationError as error:
+        listed = problems(error, Profile, values, also=("extends",), hints=OF_FAULTS | OF_ATTITUDES)
+        found += [(problem.location, str(problem)) for problem in listed]
+    name = str(values.get("unit", DEFAULT_UNIT))
+    unit = _path_of_unit(name, path.parent)
+    if unit is None:
+        found.append((("unit",), f"unit: {not_found('unit', name)}"))
+    for section, check in _checks(values, unit):
+        found += _problems_of_keys(section, values.get(section), check)
+    if found or profile is None:
+        named = ((_source_of(layers, location) or f"profile {path}", text) for location, text in found)
+        raise EmulatorError(*(f"{source}: {text}" for source, text in named))
+    return profile.read_from(path, layers)
+
+
+def _checks(
+    values: Mapping[str, Any], unit: Path | None
+) -> Iterator[tuple[str, Callable[[dict[str, Any]], object]]]:
+    """Yield the sections whose keys are those of another class or of the unit at a path, each with a check of its table."""
+    run, sky = values.get("run"), values.get("sky")
+    if "sensor" in values:
+        from starhil.emulator.sensor.model import SensorModel
+
+        yield "sensor", lambda table: SensorModel().with_(**table)
+    if isinstance(sky, dict):
+        from starhil.emulator.sensor.sky.view import Sky
+
+        whole = {key: sky[key] for key in ("date", "bodies") if key in sky}
+        yield "sky", lambda table: Sky({**whole, **table})
+    if "identifier" in values:
+        from starhil.emulator.sensor.pipeline.star_identifiers import check_options
+        from starid.identification.interface import ALGORITHMS
+
+        algorithm = run.get("algorithm", "geometric") if isinstance(run, dict) else "geometric"
+        if algorithm in ALGORITHMS:
+            yield "identifier", lambda table: check_options(algorithm, table)
+    if "parameters" in values and unit is not None:
+        try:
+            known = load_unit(unit).device_parameters
+        except IcdError:
+            return  # reported when the unit is loaded
+        yield "parameters", lambda table: _check_parameters(known, table)
+
+
+def _path_of_unit(name: str, folder: Path) -> Path | None:
+    path = folder / find("unit", name)
+    try:
+        return path if name and path.exists() else None
+    except OSError:  # too long a name, for example
+        return None
+
+
+def _problems_of_keys(
+    section: str, table: object, check: Callable[[dict[str, Any]], object]
+) -> Iterator[tuple[Sequence[object], str]]:
+    """Yield location and text of the problems of a table, each key of which is checked alone.
+
+    The rest of a table with many problems is not checked.
+    """
+    found, keys = 0, table if isinstance(table, dict) else {}
+    for number, (key, value) in enumerate(keys.items()):
+        if found >= MAX_PROBLEMS - 1:
+            yield (
+                (section,),
+                f"{section}: {len(keys) - number} more keys are not checked; correct these first",
+            )
+            return
+        try:
+            check({key: value})
+        except (EmulatorError, ProtocolError) as error:
+            yield from (((section, key), text) for text in error.problems)
+            found += 1
+
+
+def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) -> None:
+    for name, value in table.items():
+        if name not in known:
+            raise EmulatorError(f"parameters.{name}: unknown key{remedy(name, known)}")
+        if known[name].profile_key:
+            raise EmulatorError(f"parameters.{name}: set {known[name].profile_key} instead")
+        try:
+            known[name].check(value)
+        except ProtocolError as error:
+            raise EmulatorError(f"parameters.{error}") from None
+
+
+def camera_of(name_or_path: str) -> Camera:
+    """Return the camera of a profile (entry point `starid.cameras`, for `starid identify --profile`).
+
+    Raises StaridError, the only error of which `starid` makes one line, where `load_profile` raises its own.
+    """
+    from starid.camera import Camera
+    from starid.errors import StaridError
+
+    try:
+        profile = load_profile(name_or_path)
+    except EmulatorError as error:
+        raise StaridError(str(error)) from None
+    return Camera.from_dict(profile.camera.values())
+
+
+def _source_of(layers: Sequence[Layer], location: Sequence[object]) -> str:
+    """Return the last source that has the key at a location, or else the table that would hold it; empty if none has."""
+    for length in range(len(location), 0, -1):
+        for source, values in reversed(layers):
+            here: Any = values
+            for key in location[:length]:
+                try:
+                    here = here[key]
+                except (KeyError, IndexError, TypeError):
+                    break
+            else:
+                return source
+    return ""
+
+
+def _read_extended(path: Path, depth: int) -> list[Layer]:
+    """Return the files of a profile and of those that it extends, the profile's last."""
+    values = read_toml(path, "profile")
+    base = values.pop("extends", None)
+    if base is None:
+        return [(f"profile {path}", values)]
+    if not isinstance(base, str):
+        raise EmulatorError(f"profile {path}: extends: must be a name or a path, in quotes")
+    if depth >= MAX_EXTENDS_DEPTH:
+        raise EmulatorError(
+            f"profile {path}: extends: more than {MAX_EXTENDS_DEPTH} deep; does a profile extend itself?"
+        )
+    try:
+        extended = find_toml("profile", base, path.parent)
+    except EmulatorError as error:
+        raise EmulatorError(f"profile {path}: extends: {error}") from None
+    return [*_read_extended(extended, depth + 1), (f"profile {path}", values)]
+
+
+def _drop_parameters_of_camera(values: dict[str, Any]) -> None:
+    """Remove what the device knows of a camera that is going to be replaced: its parameters and their errors."""
+    values.pop("calibration", None)
+    parameters = values.get("parameters")
+    if isinstance(parameters, dict):
+        values["parameters"] = {key: value for key, value in parameters.items() if key not in OF_CAMERA}
+
+
+def _replaced_by(given: Iterable[str]) -> set[str]:
+    """Return the keys of a table that are excluded by the given ones."""
+    return {
+        key
+        for forms in ALTERNATIVES
+        for keys, by in permutations(forms, 2)
+        if not by.isdisjoint(given)
+        for key in keys
+    }
+
+
+def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge `over` into `base`, table by table.
+
+    A table with another `kind` replaces the whole table, and keys in `over` remove their alternatives from
+    `base` (field of view or focal lengths, angles or quaternion, the forms of a mount).
+    """
+    if "kind" in over and over["kind"] != base.get("kind"):
+        return dict(over)
+    dropped = _replaced_by(over)
+    merged = {key: value for key, value in base.items() if key not in dropped}
+    for key, value in over.items():
+        below = merged.get(key)
+        if isinstance(below, dict) and isinstance(value, Mapping):
+            merged[key] = merge(below, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def _apply_override(values: dict[str, Any], override: str) -> Layer:
+    """Apply one `section.key=value`, and return it as a layer; a value that is not TOML is text."""
+    key, equals, text = override.partition("=")
+    names = [name.strip() for name in key.split(".")]
+    if not equals or not all(names):
+        raise EmulatorError(f"--set {override}: write section.key=value, e.g. parameters.update_rate=5")
+    try:
+        value = parse_toml(f"value = {text}")["value"]
+    except TomlError:
+        value = text
+    table = values
+    for name in names[:-1]:
+        below = table.setdefault(name, {})
+        if not isinstance(below, dict):
+            raise EmulatorError(f"--set {override}: {name} is a value, not a section")
+        table = below
+    if ".".join(names) in PATHS and isinstance(value, str) and value and not value.startswith("~"):
+        value = str(Path(value).absolute())  # relative to the working directory, as on any command line
+    if names[-1] == "kind":
+        value = text.strip().strip("\"'")  # a name, even if it is a number: 42
+    if names[-1] == "kind" and table.get("kind") != value:
+        for other in set(table) - ({"attitude"} if value != "file" else set()):
+            del table[other]
+    for excluded in _replaced_by(names[-1:]) & table.keys():
+        del table[excluded]
+    table[names[-1]] = value
+    layer: Any = value
+    for name in reversed(names):
+        layer = {name: layer}
+    return f"--set {override}", layer

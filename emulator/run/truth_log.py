@@ -1,0 +1,120 @@
+"""The truth log: a CSV file with true and measured attitude, one row per exposure."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from starhil.emulator.device.measurement import Measurement
+from starhil.emulator.sensor.pipeline.messages import as_quaternion
+from starhil.emulator.simulation.clock import NANOSECONDS
+from starhil.emulator.simulation.output_file import Output, OutputFile
+from starid.attitude import Attitude
+
+COLUMNS: Final = (
+    "frame", "time_of_exposure_s", "run_time_s", "mode", "valid", "reason",
+    "true_qx", "true_qy", "true_qz", "true_qw", "true_wx_deg_s", "true_wy_deg_s", "true_wz_deg_s", "truth_status",
+    "measured_qx", "measured_qy", "measured_qz", "measured_qw", "measured_wx_deg_s", "measured_wy_deg_s", "measured_wz_deg_s",
+    "cross_boresight_arcsec", "roll_arcsec", "total_arcsec", "sigma_cross_arcsec", "sigma_roll_arcsec",
+    "stars_detected", "stars_matched", "rms_px", "latency_ms", "processing_ms", "render_ms", "detect_ms", "identify_ms", "late",
+)  # fmt: skip
+"""Columns: device time as Unix time, quaternions ICRS→sensor scalar last, errors of the measured attitude.
+
+`latency_ms` is simulation time from mid-exposure to publication. `processing_ms` and the next three columns
+are wall times; they are empty on the stepped clock, so that the same run gives the same file.
+"""
+
+WALL_TIMES: Final = ("processing_ms", "render_ms", "detect_ms", "identify_ms")
+
+
+def compare(measurement: Measurement) -> dict[str, Any]:
+    """Return truth, measurement and errors by the names in `COLUMNS`; None if invalid."""
+    result = measurement.result
+    truth = measurement.truth
+    row: dict[str, Any] = {
+        "frame": measurement.counter,
+        "time_of_exposure_s": measurement.mid_unix_ns / NANOSECONDS,
+        "run_time_s": measurement.mid_ns / NANOSECONDS,
+        "mode": measurement.mode.value,
+        "valid": measurement.valid,
+        "reason": measurement.reason,
+        "truth_status": truth.status.value,
+        "stars_detected": result.detected,
+        "stars_matched": result.matched,
+        "latency_ms": measurement.latency_s * 1e3,
+        "processing_ms": (result.render_s + result.detect_s + result.identify_s) * 1e3,
+        "render_ms": result.render_s * 1e3,
+        "detect_ms": result.detect_s * 1e3,
+        "identify_ms": result.identify_s * 1e3,
+        "late": measurement.late,
+    }
+    row |= zip(("true_qx", "true_qy", "true_qz", "true_qw"), as_quaternion(truth.attitude), strict=True)
+    true_rate = np.degrees(truth.rate_rad_s).tolist()
+    row |= zip(("true_wx_deg_s", "true_wy_deg_s", "true_wz_deg_s"), true_rate, strict=True)
+    if measurement.rate_valid:
+        rate = np.degrees(measurement.rate_rad_s).tolist()
+        row |= zip(("measured_wx_deg_s", "measured_wy_deg_s", "measured_wz_deg_s"), rate, strict=True)
+    if measurement.valid:
+        measured = Attitude(np.array(result.quaternion_xyzw))
+        error = measured.error_to(truth.attitude)
+        row |= zip(
+            ("measured_qx", "measured_qy", "measured_qz", "measured_qw"), as_quaternion(measured), strict=True
+        )
+        row |= {
+            "cross_boresight_arcsec": error.cross_boresight_arcsec,
+            "roll_arcsec": error.roll_arcsec,
+            "total_arcsec": error.total_arcsec,
+            "sigma_cross_arcsec": result.sigma_cross_arcsec,
+            "sigma_roll_arcsec": result.sigma_roll_arcsec,
+            "rms_px": result.rms_px,
+        }
+    return {name: row.get(name) for name in COLUMNS}
+
+
+class TruthLog:
+    """A CSV file with one row per exposure; rows are written complete and unbuffered.
+
+    The columns in `WALL_TIMES` are filled if `wall_times`. `output` is the recording of which the file is a part, if
+    any.
+    """
+
+    def __init__(
+        self, path: Path, *, overwrite: bool = False, wall_times: bool = True, output: Output | None = None
+    ) -> None:
+        self._empty_columns = () if wall_times else WALL_TIMES
+        self.file = OutputFile("truth log", path, header=_as_csv(COLUMNS), overwrite=overwrite, output=output)
+        self.close = self.file.close
+
+    def write(self, measurement: Measurement) -> None:
+        """Write the row of a measurement."""
+        self.file.append(lambda: self._row(measurement))
+
+    def _row(self, measurement: Measurement) -> bytes:
+        row = compare(measurement) | dict.fromkeys(self._empty_columns)
+        return _as_csv(_format_cell(name, value) for name, value in row.items())
+
+
+def _as_csv(cells: Iterable[str]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text).writerow(cells)
+    return text.getvalue().encode()
+
+
+def _format_cell(name: str, value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, float):
+        exact = (
+            name.startswith(("true_q", "measured_q"))
+            or name.endswith("time_s")
+            or name == "time_of_exposure_s"
+        )
+        return repr(value) if exact else f"{value:.6g}"
+    return str(value)

@@ -1,0 +1,40 @@
+"""How a run is connected to the world."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from starhil.emulator.device.device import Background
+from starhil.emulator.sensor.pipeline.imager import Imager
+from starhil.emulator.simulation.clock import Clock
+from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.transports.base import Transport
+from starhil.protocol.transports.paced import SerialTransport
+
+
+class Wiring:
+    """Connects a run to the world: directly. A recorder or a player takes the place of these connections."""
+
+    plays = False
+    """Whether a recording is played, so that no sockets are opened."""
+    repeatable = False
+    """Whether results must not depend on the speed of the machine."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+
+    def serial(self, name: str, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (the name is for others)
+        """Return the transport of a link that carries bytes."""
+        return make()
+
+    def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002 (the name is for others)
+        """Return the transport of a CAN link."""
+        return make()
+
+    def imager(self, inner: Imager) -> Imager:
+        """Return the pipeline for the device."""
+        return inner
+
+    def background(self, inner: Background) -> Background:
+        """Return the function that runs slow writes."""
+        return inner

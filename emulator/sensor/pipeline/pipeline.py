@@ -1,0 +1,413 @@
+"""The image pipeline: renders images, detects stars and identifies them."""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import math
+import subprocess
+import time
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
+from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sensor.pipeline.binning import mean_over_squares
+from starhil.emulator.sensor.pipeline.bodies import bodies_in_field, stars_seen, with_bodies
+from starhil.emulator.sensor.pipeline.image_source import ImageSource, open_images, used_bits
+from starhil.emulator.sensor.pipeline.messages import (
+    Failure,
+    FrameRequest,
+    FrameResult,
+    ImageRequest,
+    ImageResult,
+    IndexReady,
+    IndexRequest,
+    MatchedStar,
+    PipelineReady,
+    PipelineSetup,
+    Preview,
+    SolverSettings,
+    as_triple,
+    camera_constants,
+)
+from starhil.emulator.sensor.pipeline.precompile import start_helper
+from starhil.emulator.sensor.pipeline.preview import make_preview
+from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
+from starhil.emulator.sensor.renderer import Frame, Renderer, frame_without_truth
+from starhil.emulator.sensor.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
+from starhil.emulator.sensor.sky.view import Sky
+from starhil.emulator.simulation.guard import one_line
+from starhil.emulator.truth.source import ZERO_RATE, TruthState
+from starid.arrays import Array
+from starid.attitude import Attitude
+from starid.camera import Camera
+from starid.camera.calibration import attitude_covariance
+from starid.catalog import load_catalog
+from starid.catalog.aberration import aberrated
+from starid.errors import StaridError
+from starid.identification.interface import StarIdentifier
+from starid.identification.solution import Reason, Solution
+from starid.imaging.detection import Detections, DetectionSettings, detect
+
+STARS_SENT: Final = 16
+"""Number of identified stars returned to the device; the brightest ones."""
+
+DOWNLOAD_BITS: Final = 8
+"""Bits per pixel of an image for download."""
+
+_WARM_UP_BODIES: Final = SkyObjects(
+    sun=SunGlare(0.0, 80.0),
+    moon=Moon(90.0, 80.0),
+    earth=EarthLimb(180.0, 20.0, sun_ra_deg=0.0, sun_dec_deg=0.0),
+)
+"""Bodies in and near the field of the identity attitude."""
+
+_WARM_UP_EXPOSURE_S: Final = 1.0
+"""Exposure in which a dim sensor too sees enough stars to follow their trails, seconds."""
+
+_WARM_UP_RATES_RAD_S: Final = ((1e-4, 0.0, 0.0), (3e-3, 0.0, 0.0))
+"""Rates at which stars in this exposure are round, or leave trails of a few pixels."""
+
+
+def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Failure:
+    """Make a pipeline and warm it up; on failure, return the reason in one line."""
+    begin = time.perf_counter()
+    try:
+        helper = start_helper()
+        pipeline = Pipeline(setup)
+        images = open_images(setup.images, pipeline.camera)
+        if images is not None:
+            images.image(0)  # an image of the wrong size fails before the long start
+        pipeline.warm_up(helper)
+        pipeline.images = images
+    except (EmulatorError, StaridError) as error:
+        return Failure(str(error))
+    except Exception as error:  # noqa: BLE001 (reported in one line instead of the worker's traceback)
+        return Failure(f"pipeline: internal error: {one_line(error)}")
+    warm = PipelineReady(pipeline.camera.to_dict(), len(pipeline.catalog), time.perf_counter() - begin)
+    return pipeline, warm
+
+
+@dataclass(frozen=True)
+class _Exposure:
+    """An image, its number of bits, the number of its exposure, and the bodies in its field.
+
+    A rendered image also has its truth: the frame and the objects of the sky.
+    """
+
+    image: NDArray[Any]
+    bits: int
+    index: int
+    in_field: tuple[str, ...] = ()
+    frame: Frame | None = None
+    objects: SkyObjects = field(default_factory=SkyObjects)
+
+
+class Pipeline:
+    """Renderer, detector and star identifier of a run, with the state they keep between frames."""
+
+    def __init__(self, setup: PipelineSetup) -> None:
+        self._setup = setup
+        self.camera = Camera.from_dict(setup.camera)
+        self.catalog = load_catalog(setup.catalog_path or None, setup.epoch)
+        self._sensor = SensorModel().with_(**setup.sensor)
+        self._renderer = Renderer(self.camera, self.catalog, self._sensor, setup.seed)
+        self._identifiers = StarIdentifiers(
+            lambda wanted: wanted.make(self.catalog), in_background=setup.build_in_background
+        )
+        self._sky = Sky(setup.sky)
+        self._last: _Exposure | None = None
+        self.images: ImageSource | None = None
+        """Source of images; None: they are rendered."""
+        self._dark: DarkMap | None = None
+        self._calibration = None if setup.calibration is None else np.array(setup.calibration)
+        """Covariance (9, 9) of the calibrated camera's parameters; None: they are exact."""
+
+    def warm_up(self, helper: subprocess.Popen[bytes] | None = None) -> None:
+        """Render and solve frames, lost in space and tracking, so that every kernel is compiled.
+
+        Compiling a kernel during a run would interrupt frames for seconds, so some frames here have star
+        trails. A `helper` that compiles the star identifier is waited for.
+        """
+        settings = replace(SolverSettings(), **camera_constants(self.camera.to_dict()))
+        attitude = Attitude.identity()
+        request = FrameRequest(
+            index=0,
+            truth=TruthState(attitude, ZERO_RATE),
+            exposure_s=_WARM_UP_EXPOSURE_S,
+            gain=self._sensor.gain,
+            settings=settings,
+            preview=self._setup.previews,
+        )
+        if helper is not None:
+            gc.disable()  # as in the helper
+            for rate in _WARM_UP_RATES_RAD_S:
+                frame = self._renderer.render(Attitude.identity(), rate, exposure_s=_WARM_UP_EXPOSURE_S)
+                detect(frame.image, detection_settings(self._sensor.detection_settings(), settings))
+            helper.wait()  # kernels it compiled are loaded below; any others are compiled there
+        for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):
+            turning = TruthState(attitude, np.array(rate))
+            self._process_frame(replace(request, truth=turning, predicted=predicted))
+        if self._sky.by_date:
+            for earth in (_WARM_UP_BODIES.earth, EarthLimb(180.0, 80.0, radius_deg=5.0)):
+                self._renderer.render(Attitude.identity(), objects=replace(_WARM_UP_BODIES, earth=earth))
+        self._last = None
+        gc.enable()
+
+    def handle(
+        self, request: FrameRequest | ImageRequest | IndexRequest
+    ) -> FrameResult | ImageResult | IndexReady | Failure:
+        """Process a request; return a failure if the settings make it impossible."""
+        try:
+            if isinstance(request, IndexRequest):
+                self._identifiers.build(self._identifier_setup(request))
+                return IndexReady()
+            if isinstance(request, ImageRequest):
+                return self._scaled_image(request)
+            return self._process_frame(request)
+        except (EmulatorError, StaridError) as error:
+            return Failure(str(error))
+        except Exception as error:  # noqa: BLE001 (one frame that fails must not end those after it)
+            return Failure(f"pipeline: internal error: {one_line(error)}")
+
+    def _process_frame(self, request: FrameRequest) -> FrameResult:
+        begin = time.perf_counter()
+        sensor = self._sensor.with_(exposure_s=request.exposure_s, gain=request.gain)
+        if sensor.gain != self._renderer.sensor.gain:
+            self._renderer = self._renderer.with_sensor(sensor)
+        exposure = self._last = self._expose(request)
+        rendered = time.perf_counter()
+        if not request.solve:
+            preview = self._preview(exposure, sensor) if request.preview else None
+            return FrameResult(request.index, solved=False, render_s=rendered - begin, preview=preview)
+        if self.images is None:
+            image, known = self._without_dark(exposure.image, request), sensor.detection_settings()
+        else:
+            image, known = exposure.image, DetectionSettings()
+        found = detect(image, detection_settings(known, request.settings))
+        detected = time.perf_counter()
+        identifier, current = self._identifiers.get(self._identifier_setup(request))
+        solution = self._solve(identifier, found, request)
+        solved = time.perf_counter()
+        modelled = identifier.catalog.vectors[solution.catalog_index]
+        times = (begin, rendered, detected, solved)
+        result = self._frame_result(request, sensor, found, solution, modelled, times)
+        if exposure.frame is not None:
+            stars = exposure.frame.stars
+            seen = stars_seen(stars.xy_px[stars.visible], found.xy_px) if exposure.in_field else 0
+            enough = seen >= request.settings.min_stars_matched
+            result = with_bodies(result, exposure.in_field, enough_stars=enough)
+        if request.preview:
+            result = replace(result, preview=self._preview(exposure, sensor, found, solution))
+        return result if current else replace(result, index_pending=True)
+
+    def _preview(
+        self,
+        exposure: _Exposure,
+        sensor: SensorModel,
+        found: Detections | None = None,
+        solution: Solution | None = None,
+    ) -> Preview:
+        """Return the preview of an image; without truth if the image was not rendered."""
+        frame = exposure.frame or frame_without_truth(exposure.image, exposure.index)
+        return make_preview(frame, self.camera, sensor, exposure.objects, found, solution)
+
+    def _expose(self, request: FrameRequest) -> _Exposure:
+        """Take the next image from its source, or render it."""
+        if self.images is not None:
+            image = self.images.image(request.index)
+            return _Exposure(image, used_bits(image), request.index)
+        truth, orbit = request.truth, request.truth.orbit
+        attitude = Attitude(truth.attitude.quaternion_xyzw)  # read-only again, which pickling does not keep
+        position, velocity = (None, None) if orbit is None else (orbit.position_m, orbit.velocity_m_s)
+        sky = self._sky.view(truth.unix_s, position, velocity, request.faults)
+        objects = sky.objects
+        if request.particles_s > 0.0:
+            objects = replace(objects, cosmic_rays_s=objects.cosmic_rays_s + request.particles_s)
+        frame = self._renderer.render(
+            attitude,
+            truth.rate_rad_s,
+            request.index,
+            exposure_s=request.exposure_s,
+            temperature_c=request.temperature_c,
+            objects=objects,
+            observer=sky.observer,
+        )
+        in_field = bodies_in_field(objects, attitude, self.camera)
+        return _Exposure(frame.image, self._sensor.bits, frame.frame_index, in_field, frame, objects)
+
+    def _without_dark(self, image: NDArray[Any], request: FrameRequest) -> NDArray[Any]:
+        """Subtract the unit's dark frame, scaled to the exposure, gain and temperature of the image."""
+        if self._setup.dark_frames == 0:
+            return image
+        if self._dark is None:
+            camera, setup = self.camera, self._setup
+            self._dark = measure_dark_map(
+                self._sensor, camera.height, camera.width, setup.dark_frames, setup.seed
+            )
+        temperature = self._sensor.temperature_c if request.temperature_c is None else request.temperature_c
+        return self._dark.subtracted(image, request.exposure_s, request.gain, temperature)
+
+    def _solve(self, identifier: StarIdentifier, found: Detections, request: FrameRequest) -> Solution:
+        settings = request.settings
+        chosen = slice(0, settings.max_stars_matched if self._setup.algorithm == "geometric" else None)
+        xy, flux = found.xy_px[chosen], found.flux[chosen] / request.exposure_s
+        sigma = np.sqrt(np.mean(found.xy_sigma_px[chosen] ** 2, axis=1))
+        if request.predicted is None:
+            solution = identifier.identify(xy, flux, sigma, observer_velocity=request.observer_velocity)
+        else:
+            windows_px = (settings.search_width / 2.0, settings.window_width / 2.0)
+            solution = identifier.track(
+                xy,
+                flux,
+                np.array(request.predicted.quaternion_xyzw),
+                sigma,
+                window_px=float(min(settings.tracking_margin, *windows_px)),
+                observer_velocity=request.observer_velocity,
+            )
+        if not solution.valid:
+            return solution
+        if _within_margin(identifier, solution, xy, request) < settings.min_stars_matched:
+            reason = (
+                Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
+            )
+            return Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
+        if self._calibration is None:
+            return solution
+        camera, used = calibrated_camera(self.camera, settings), solution.detection_index
+        known = attitude_covariance(camera, self._calibration, xy[used], sigma[used])
+        return replace(solution, covariance=solution.covariance + known)
+
+    def _identifier_setup(self, request: FrameRequest | IndexRequest) -> StarIdentifierSetup:
+        """Return the setup of the star identifier for the parameters and the calibrated camera."""
+        setup, settings = self._setup, request.settings
+        options: dict[str, Any] = {**setup.identifier}
+        options.setdefault("limiting_magnitude", settings.limiting_magnitude)
+        if setup.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
+            options.setdefault("zero_point", 2.5 * math.log10(self._sensor.zero_magnitude_e_s))
+        camera = calibrated_camera(self.camera, settings)
+        margin = settings.error_margin / 100.0
+        return StarIdentifierSetup(
+            setup.algorithm, camera, margin, tuple(sorted(options.items())), request.upsets
+        )
+
+    def _frame_result(
+        self,
+        request: FrameRequest,
+        sensor: SensorModel,
+        found: Detections,
+        solution: Solution,
+        modelled: Array,
+        times: tuple[float, float, float, float],
+    ) -> FrameResult:
+        begin, rendered, detected, solved = times
+        zero_e = sensor.zero_magnitude_e_s * sensor.exposure_s
+        measured = self.camera.back_project(found.xy_px[solution.detection_index])
+        stars = sorted(
+            (
+                MatchedStar(
+                    hip=int(hip),
+                    x=float(found.xy_px[row, 0]),
+                    y=float(found.xy_px[row, 1]),
+                    magnitude=-2.5 * math.log10(max(float(found.flux[row]), 1.0) / zero_e),
+                    snr=float(found.flux[row] / found.flux_sigma[row]),
+                    vector=as_triple(direction),
+                    icrs=as_triple(icrs),
+                )
+                for row, hip, direction, icrs in zip(
+                    solution.detection_index, solution.hip, measured, modelled, strict=True
+                )
+            ),
+            key=lambda star: (star.magnitude, star.hip),
+        )
+        valid = solution.valid
+        x, y, z, w = solution.quaternion_xyzw.tolist() if valid else (0.0, 0.0, 0.0, 0.0)
+        reason = solution.reason.value if found.searchable else "detection_failed"
+        rate = solution.rate_rad_s
+        return FrameResult(
+            index=request.index,
+            valid=valid,
+            reason=reason,
+            tracked=solution.mode == "tracking",
+            quaternion_xyzw=(x, y, z, w),
+            sigma_cross_arcsec=solution.cross_boresight_sigma_arcsec if valid else 0.0,
+            sigma_roll_arcsec=solution.roll_sigma_arcsec if valid else 0.0,
+            rate_rad_s=None if rate is None else (float(rate[0]), float(rate[1]), float(rate[2])),
+            detected=len(found.flux),
+            refused=found.rejected,
+            matched=solution.star_count,
+            stars=tuple(stars[:STARS_SENT]),
+            probability_false=solution.probability_false if valid else 1.0,
+            rms_px=solution.rms_px if valid else 0.0,
+            background_dn=float(found.background),
+            noise_dn=float(found.noise),
+            render_s=rendered - begin,
+            detect_s=detected - rendered,
+            identify_s=solved - detected,
+        )
+
+    def _scaled_image(self, request: ImageRequest) -> ImageResult:
+        if self._last is None:
+            return ImageResult(0, 0, -1, b"")
+        image, bits, frame = self._last.image, self._last.bits, self._last.index
+        if request.edge == 0:
+            height, width = image.shape
+            return ImageResult(width, height, frame, eight_bits(image, bits).tobytes())
+        return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
+
+
+def _within_margin(identifier: StarIdentifier, solution: Solution, xy: Array, request: FrameRequest) -> int:
+    """Count the matched stars within the validation margin of their expected position."""
+    icrs = identifier.catalog.vectors[solution.catalog_index]
+    if request.observer_velocity is not None:
+        icrs = aberrated(icrs, request.observer_velocity)
+    expected_xy, _ = identifier.camera.project(solution.attitude.to_sensor(icrs))
+    offset_px = np.hypot(*(expected_xy - xy[solution.detection_index]).T)
+    return int(np.count_nonzero(offset_px <= request.settings.validation_margin))
+
+
+def detection_settings(known: DetectionSettings, settings: SolverSettings) -> DetectionSettings:
+    """Return the known detection settings, with the thresholds in the parameters of the device."""
+    return replace(
+        known,
+        threshold_sigma=settings.detection_threshold,
+        pixel_sigma=settings.star_threshold,
+        min_star_pixels=settings.min_star_pixels,
+        max_star_pixels=settings.max_star_pixels,
+    )
+
+
+def calibrated_camera(optics: Camera, settings: SolverSettings) -> Camera:
+    """Return the camera as calibrated in the device parameters; other constants come from the optics."""
+    return Camera(
+        optics.width,
+        optics.height,
+        (settings.focal_length, settings.focal_length * optics.focal_px[1] / optics.focal_px[0]),
+        (settings.centroid_x, settings.centroid_y),
+        optics.model,
+        (settings.k1, settings.k2, settings.p1, settings.p2, optics.distortion[4]),
+    )
+
+
+def eight_bits(image: NDArray[Any], bits: int) -> NDArray[np.uint8]:
+    """Reduce an image of `bits` bits to its eight most significant."""
+    return (image >> max(0, bits - DOWNLOAD_BITS)).astype(np.uint8)
+
+
+def square_image(image: NDArray[Any], bits: int, edge: int) -> bytes:
+    """Scale an image to a square of `edge` pixels at 8 bits, row by row.
+
+    The image is padded with black at the right and bottom to a square of the next power of two, which keeps
+    its pixel positions, and then averaged over squares of pixels. `edge` is one of `IMAGE_EDGES`.
+    """
+    height, width = image.shape
+    full = 1 << (max(height, width) - 1).bit_length()
+    full = max(full, edge)
+    square = np.zeros((full, full), dtype=np.uint8)
+    square[:height, :width] = eight_bits(image, bits)
+    return mean_over_squares(square, full // edge).tobytes()

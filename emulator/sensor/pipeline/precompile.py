@@ -1,0 +1,41 @@
+"""Compilation of half of the kernels in a second process, in parallel with the pipeline.
+
+Kernels are compiled once after an installation or a change, and cached on disk. The second process compiles those
+of the star identifier, and first the one that splits pairs: meanwhile the pipeline compiles the projection, which both
+need.
+"""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+from typing import Any
+
+from starhil.emulator.sensor.pipeline.parent_death_signal import end_with_parent
+from starid.camera.projection import back_project_kernel
+
+
+def start_helper() -> subprocess.Popen[bytes] | None:
+    """Start the process that compiles the star identifier, unless the cache has kernels; the caller must wait for it."""
+    kernel: Any = back_project_kernel
+    if kernel.store.in_cache:
+        return None
+    return subprocess.Popen(
+        [sys.executable, "-m", "starhil.emulator.sensor.pipeline.precompile"], stdin=subprocess.DEVNULL
+    )
+
+
+def main() -> None:
+    """Compile kernels into the cache."""
+    end_with_parent()
+    gc.disable()  # compiling makes many objects and little garbage: collecting it takes an eighth of the time
+    from starid.identification.geometric.identifier import Identifier
+    from starid.imaging import pairs
+
+    pairs.warm_up()
+    Identifier().warm_up()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,164 @@
+"""The current star identifier, and building of a new one in the background when parameters change.
+
+A new limiting magnitude or camera needs a new star index, which takes seconds to build. Until it is
+ready, frames are solved with the current identifier.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sensor.pipeline.messages import CatalogUpset
+from starhil.protocol.errors import remedy
+from starid.camera import Camera
+from starid.catalog import StarCatalog
+from starid.errors import StaridError
+from starid.identification.interface import ALGORITHMS, StarIdentifier, make_identifier
+
+if TYPE_CHECKING:
+    from starid.identification.geometric.identifier import Identifier
+
+_KINDS: Final[dict[str, tuple[type, ...]]] = {
+    "float": (int, float),
+    "int": (int,),
+    "bool": (bool,),
+    "str": (str,),
+}
+"""Type name in an annotation → types accepted from a profile."""
+
+
+@dataclass(frozen=True)
+class StarIdentifierSetup:
+    """Everything a star identifier depends on."""
+
+    algorithm: str
+    camera: Camera
+    """Camera as calibrated in the device's parameters."""
+    margin: float
+    """Tolerance of triangle sides relative to the nominal one; geometric algorithm only."""
+    options: tuple[tuple[str, Any], ...]
+    """Keyword arguments of the algorithm's class, sorted by name."""
+    upsets: tuple[CatalogUpset, ...] = ()
+    """Bits flipped in the directions of the stars; geometric algorithm only."""
+
+    def make(self, catalog: StarCatalog) -> StarIdentifier:
+        """Make the star identifier, which takes seconds if its index is not cached on disk."""
+        options = dict(self.options)
+        check_options(self.algorithm, options)
+        if self.algorithm != "geometric":
+            return make_identifier(self.algorithm, self.camera, catalog, **options)
+        from starid.identification.geometric.identifier import Effort, Identifier
+
+        nominal = Effort()
+        options["effort"] = replace(nominal, tolerance_px=nominal.tolerance_px * self.margin)
+        identifier = Identifier(self.camera, catalog, **options)
+        for upset in self.upsets:
+            identifier = _with_upset(identifier, upset)
+        return identifier
+
+
+def check_options(algorithm: str, options: Mapping[str, Any]) -> None:
+    """Reject an option that an algorithm does not have, or a value of the wrong type."""
+    module, name = ALGORITHMS[algorithm]
+    known = _known_options(getattr(importlib.import_module(module), name))
+    for option, value in options.items():
+        if option not in known:
+            hint = remedy(option, known)
+            raise EmulatorError(f"identifier.{option}: not an option of the algorithm {algorithm}{hint}")
+        allowed = tuple(kind for word, kinds in _KINDS.items() if word in known[option] for kind in kinds)
+        if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
+            raise EmulatorError(
+                f"identifier.{option}: must be {known[option].removesuffix(' | None')}, not {value!r}"
+            )
+
+
+def _with_upset(identifier: Identifier, upset: CatalogUpset) -> Identifier:
+    """Return the identifier with one bit of a star's direction flipped; unchanged if it lacks the star."""
+    rows = np.flatnonzero(identifier.stars.hip == upset.hip)
+    if len(rows) == 0:
+        return identifier
+    direction = identifier.directions[rows[0]].copy()
+    bits = direction.astype(np.float32).view(np.uint32)
+    bits[upset.component] ^= np.uint32(1 << upset.bit)
+    direction[upset.component] = bits.view(np.float32)[upset.component]
+    return identifier.with_direction(int(rows[0]), direction)
+
+
+def _known_options(algorithm: type) -> dict[str, str]:
+    """Return the type of each option of an algorithm: keywords of its class, and fields of `options`."""
+    types = {name: str(item.annotation) for name, item in inspect.signature(algorithm).parameters.items()}
+    for held in get_args(get_type_hints(inspect.getattr_static(algorithm, "__init__")).get("options")):
+        if is_dataclass(held):
+            hints = get_type_hints(held)
+            types |= {
+                field.name: "str" if get_origin(hints[field.name]) is Literal else str(field.type)
+                for field in fields(held)
+            }
+    return {name: kind for name, kind in types.items() if any(word in kind for word in _KINDS)}
+
+
+class StarIdentifiers:
+    """Provides the star identifier for a setup, or the previous one while it is being built.
+
+    It is built in a thread if `in_background`; otherwise, and for the first one, `get` blocks until that is done.
+    """
+
+    def __init__(self, make: Callable[[StarIdentifierSetup], StarIdentifier], *, in_background: bool) -> None:
+        self._make = make
+        self._in_background = in_background
+        self._current: tuple[StarIdentifierSetup, StarIdentifier] | None = None
+        self._failed: tuple[StarIdentifierSetup, EmulatorError | StaridError] | None = None
+        self._build: tuple[StarIdentifierSetup, Future[StarIdentifier]] | None = None
+
+    def get(self, setup: StarIdentifierSetup) -> tuple[StarIdentifier, bool]:
+        """Return the current star identifier, and whether it is the one for this setup."""
+        self._adopt_finished_build()
+        if self._current is None or not self._in_background:
+            return self.build(setup), True
+        current_setup, identifier = self._current
+        if current_setup == setup:
+            return identifier, True
+        if self._failed is not None and self._failed[0] == setup:
+            error = self._failed[1]
+            raise type(error)(str(error))
+        if self._build is None:
+            self._build = (setup, self._start_build(setup))
+        return identifier, False
+
+    def build(self, setup: StarIdentifierSetup) -> StarIdentifier:
+        """Return the star identifier for this setup, and discard a build in the background."""
+        self._build = None
+        if self._current is None or self._current[0] != setup:
+            self._current = (setup, self._make(setup))
+        return self._current[1]
+
+    def _adopt_finished_build(self) -> None:
+        """Switch to a finished build, even if the setup has changed since; the next one will replace it."""
+        if self._build is None or not self._build[1].done():
+            return
+        (setup, future), self._build = self._build, None
+        try:
+            self._current = (setup, future.result())
+        except (EmulatorError, StaridError) as error:
+            self._failed = (setup, error)
+
+    def _start_build(self, setup: StarIdentifierSetup) -> Future[StarIdentifier]:
+        future: Future[StarIdentifier] = Future()
+
+        def build() -> None:
+            try:
+                future.set_result(self._make(setup))
+            except Exception as error:  # noqa: BLE001 (raised again by future.result())
+                future.set_exception(error)
+
+        threading.Thread(target=build, name="star-identifier", daemon=True).start()
+        return future

@@ -1,0 +1,86 @@
+"""The pipeline worker: renders and solves frames for the emulator over a socket, in a process or a thread."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import socket
+import sys
+from typing import Any, Final
+
+from starhil.emulator.sensor.pipeline.messages import LENGTH, Failure, with_length
+from starhil.emulator.sensor.pipeline.parent_death_signal import end_with_parent
+from starhil.emulator.simulation.guard import one_line
+
+NICE: Final = 5
+"""Niceness of the worker, so that the links have priority on a busy machine."""
+
+
+def main() -> None:
+    """Serve the emulator over an inherited socket."""
+    end_with_parent()  # a closed socket is not noticed during a long compilation
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # the emulator ends this process by closing the socket
+    os.nice(NICE)
+    serve(socket.socket(fileno=int(sys.argv[1])))
+
+
+def serve_in_thread(link: socket.socket) -> None:
+    """Serve the emulator, and report an unexpected end."""
+    with link:
+        try:
+            serve(link)
+        except BaseException as error:  # noqa: BLE001 (its pending requests must fail)
+            _send(link, f"pipeline thread: ended: {one_line(error)}")
+
+
+def serve(link: socket.socket) -> None:
+    """Receive the setup, then requests, until the emulator closes the socket."""
+    from starhil.emulator.sensor.pipeline.pipeline import make_pipeline  # imported while the emulator starts
+
+    setup = _receive(link)
+    if setup is None:
+        return
+    made = make_pipeline(setup)
+    if isinstance(made, Failure):
+        _send(link, made)
+        return
+    pipeline, warm = made
+    _send(link, warm)
+    while (request := _receive(link)) is not None:
+        _send(link, pipeline.handle(request))
+
+
+def _receive(link: socket.socket) -> Any:
+    """Return the next message, or None once the socket is closed."""
+    head = _read(link, LENGTH.size)
+    if head is None:
+        return None
+    data = _read(link, LENGTH.unpack(head)[0])
+    return None if data is None else pickle.loads(data)  # noqa: S301 (from our own parent process)
+
+
+def _read(link: socket.socket, size: int) -> bytes | None:
+    chunks: list[bytes] = []
+    while size > 0:
+        try:
+            chunk = link.recv(min(size, 1 << 20))
+        except ConnectionError:
+            return None
+        if not chunk:
+            return None
+        chunks.append(chunk)
+        size -= len(chunk)
+    return b"".join(chunks)
+
+
+def _send(link: socket.socket, message: object) -> None:
+    try:
+        link.sendall(with_length(message))
+    except ConnectionError:
+        raise SystemExit(0) from None
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Time and events, and what may fail without ending a run."""

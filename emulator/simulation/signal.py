@@ -1,0 +1,35 @@
+"""Typed signals, with which one part of a run reports something to all parts that have connected to it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+from starhil.emulator.simulation.guard import call_guarded
+
+Message = TypeVar("Message")
+
+
+class Signal(Generic[Message]):
+    """Passes each message to its observers, in the order in which they were connected.
+
+    An observer that fails is logged, and stops neither the sender nor the other observers.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.observers: list[Callable[[Message], object]] = []
+
+    def connect(self, observer: Callable[[Message], object]) -> None:
+        """Call a function with each further message."""
+        self.observers.append(observer)
+
+    def disconnect(self, observer: Callable[[Message], object]) -> None:
+        """Call a function no more, if it is connected."""
+        if observer in self.observers:
+            self.observers.remove(observer)
+
+    def emit(self, message: Message) -> None:
+        """Report a message."""
+        for observer in self.observers:
+            call_guarded(self.name, observer, message)

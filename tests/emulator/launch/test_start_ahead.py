@@ -1,0 +1,82 @@
+"""The worker is started before anything else is imported, and a kernel needs no whole `scipy.linalg`."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
+
+AHEAD = """
+import sys
+from starhil.emulator.sensor.pipeline import worker_process
+class Worker:
+    def __init__(self):
+        print("worker", "typer" in sys.modules, "pydantic" in sys.modules)
+        raise KeyboardInterrupt
+worker_process.WorkerProcess = Worker
+from starhil.emulator.cli import main
+sys.argv[1:] = {arguments}
+main()
+"""
+
+BLAS = """
+import sys
+import numpy as np
+import starid.kernels.compiler
+from numba import njit
+print("scipy.linalg" in sys.modules)
+@njit
+def product(a, b):
+    return a @ b
+print(np.array_equal(product(np.eye(3), np.eye(3)), np.eye(3)))
+"""
+
+
+def python(program):
+    command = [sys.executable, "-c", program]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_before_the_event_loop_ends_a_run_as_a_later_one_does(number):
+    program = AHEAD.replace("raise KeyboardInterrupt", f"import signal; signal.raise_signal({int(number)})")
+    ended = python(program.format(arguments=["run", "ideal"]))
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert ended.stdout.startswith("worker")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [(["run", "demo"], "worker False False"), (["run", "--help"], "Usage"), ([], "Usage")],
+)
+def test_only_a_run_starts_its_worker_before_anything_else_is_imported(arguments, said):
+    ended = python(AHEAD.format(arguments=arguments))
+    assert said in ended.stdout + ended.stderr
+    assert ("worker" in ended.stdout.split()) == (said.startswith("worker"))
+
+
+@pytest.mark.process
+def test_ctrl_c_in_a_terminal_does_not_reach_the_worker():
+    worker = WorkerProcess()
+    try:
+        assert os.getpgid(worker.process.pid) == worker.process.pid
+    finally:
+        worker.end()
+
+
+def test_a_worker_that_was_started_ahead_is_taken_once(monkeypatch):
+    from starhil.emulator.sensor.pipeline import worker_process
+
+    monkeypatch.setattr(worker_process, "WorkerProcess", object)
+    worker_process.start_ahead()
+    first, second = worker_process.take_worker(), worker_process.take_worker()
+    assert first is not second
+    assert worker_process._ahead == []
+
+
+def test_a_kernel_that_multiplies_matrices_finds_what_it_needs_when_it_is_called():
+    ended = python(BLAS)
+    assert ended.stdout.split() == ["False", "True"], ended.stderr

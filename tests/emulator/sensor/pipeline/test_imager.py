@@ -1,0 +1,212 @@
+"""The outcome of requests when an answer's callback fails, or when the pipeline ends in the middle."""
+
+import asyncio
+import pickle
+
+import pytest
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile import Profile
+from starhil.emulator.profile.pipeline_setup import pipeline_setup
+from starhil.emulator.sensor.pipeline.imager import WorkerImager
+from starhil.emulator.sensor.pipeline.messages import (
+    Failure,
+    FrameResult,
+    ImageRequest,
+    PipelineEnded,
+    PipelineReady,
+    with_length,
+)
+from starhil.emulator.sensor.pipeline.worker_process import WorkerThread
+from tests.emulator.runs import CAMERA
+from tests.emulator.workers import ANSWERING, WORKER
+
+SETUP = pipeline_setup(Profile())
+WITHIN_S = 20.0
+REQUEST = ImageRequest(64)
+
+
+class FakePipeline:
+    """Answers with numbered frames; `ImageRequest(0)` ends the thread."""
+
+    def __init__(self):
+        self.count = 0
+
+    def handle(self, request):
+        if request.edge == 0:
+            raise SystemExit
+        self.count += 1
+        return FrameResult(self.count)
+
+
+@pytest.fixture(params=["process", "thread"])
+def make_imager(request, worker, monkeypatch):
+    """Make an imager that answers with numbered frames and can be killed."""
+    monkeypatch.setattr(
+        "starhil.emulator.sensor.pipeline.pipeline.make_pipeline",
+        lambda _setup: (FakePipeline(), PipelineReady({}, 5, 0.0)),
+    )
+
+    def make():
+        if request.param == "process":
+            imager = WorkerImager(SETUP, worker(ANSWERING))
+            imager.kill = lambda: imager.worker.process.kill()
+        else:
+            imager = WorkerImager(SETUP, WorkerThread())
+            imager.kill = lambda: imager._writer.write(with_length(ImageRequest(0)))
+        return imager
+
+    return make
+
+
+def run(imager_of, scenario):
+    async def whole():
+        imager = imager_of()
+        try:
+            await asyncio.wait_for(imager.start(), WITHIN_S)
+            await asyncio.wait_for(scenario(imager), WITHIN_S)
+        finally:
+            await imager.close()
+
+    asyncio.run(whole())
+
+
+def test_a_callback_that_fails_is_logged_and_the_next_requests_are_answered(make_imager, caplog):
+    answers = []
+
+    async def scenario(imager):
+        imager.submit(REQUEST, lambda answer: answer.no_such_field)
+        imager.submit(REQUEST, answers.append)
+        await imager.settle()
+        imager.submit(REQUEST, answers.append)
+        await imager.settle()
+        assert imager.pending == 0
+
+    run(make_imager, scenario)
+    assert [answer.index for answer in answers] == [2, 3]
+    (said,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert "no_such_field" in said
+    assert "\n" not in said
+
+
+def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_imager, caplog):
+    answers, losses = [], []
+
+    async def scenario(imager):
+        imager.ended.connect(losses.append)
+        imager.kill()
+        imager.submit(REQUEST, answers.append)
+        await imager.settle()
+        while not losses:
+            await asyncio.sleep(0.01)
+        imager.submit(REQUEST, answers.append)
+        assert [type(answer) for answer in answers] == [PipelineEnded, PipelineEnded]
+        await imager.restart()
+        imager.submit(REQUEST, answers.append)
+        await imager.settle()
+        assert isinstance(answers[-1], FrameResult)
+
+    run(make_imager, scenario)
+    (said,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert [said] == losses
+
+
+def test_requests_fail_in_their_order_before_the_death_of_the_worker_is_noticed(worker):
+    answers = []
+
+    async def scenario(imager):
+        imager.submit(REQUEST, lambda answer: answers.append(("first", type(answer))))
+        imager.worker.process.kill()
+        imager.worker.process.wait()
+        imager.submit(REQUEST, lambda answer: answers.append(("second", type(answer))))
+        await imager.settle()
+
+    silent = f"{WORKER}send(PipelineReady({CAMERA}, 5, 0.0))\nreceive()\nreceive()\n"
+    run(lambda: WorkerImager(SETUP, worker(silent)), scenario)
+    assert answers == [("first", PipelineEnded), ("second", PipelineEnded)]
+
+
+def test_a_failure_handler_that_fails_keeps_no_request_pending(make_imager, caplog):
+    async def scenario(imager):
+        imager.ended.connect(lambda _text: 1 / 0)
+        imager.kill()
+        imager.submit(REQUEST, lambda _answer: None)
+        await imager.settle()
+        while "ZeroDivisionError" not in caplog.text:
+            await asyncio.sleep(0.01)
+
+    run(make_imager, scenario)
+
+
+@pytest.mark.parametrize("bad", ["b'no pickle'", "pickle.dumps(PipelineReady)", "pickle.dumps(None) + b'x'"])
+def test_an_answer_that_cannot_be_read_loses_the_worker_and_is_logged(worker, caplog, bad):
+    program = WORKER + (
+        "send(PipelineReady({}, 5, 0.0))\n"
+        f"data = {bad}\nreceive()\nstream.write(LENGTH.pack(len(data)) + data)\n"
+        "send(FrameResult(1)); send(FrameResult(2))\nstream.flush()\nreceive()\n"
+    )
+    answers, losses = [], []
+
+    async def scenario(imager):
+        imager.ended.connect(losses.append)
+        imager.submit(REQUEST, answers.append)
+        while not losses:
+            await asyncio.sleep(0.01)
+        await imager.settle()
+        imager.submit(REQUEST, answers.append)
+        assert isinstance(answers[-1], Failure)
+
+    run(lambda: WorkerImager(SETUP, worker(program)), scenario)
+    assert "cannot be read" in losses[0]
+    assert "\n" not in losses[0]
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        "",
+        WORKER + "send(Failure('no catalogue'))\n",
+        WORKER + "stream.write(LENGTH.pack(3) + b'abc')\nstream.flush()\nreceive()\n",
+    ],
+)
+def test_a_start_that_fails_raises_once_and_is_no_loss(worker, program):
+    losses = []
+
+    async def scenario():
+        imager = WorkerImager(SETUP, worker(program))
+        imager.ended.connect(losses.append)
+        try:
+            with pytest.raises(EmulatorError, match=r"no catalogue|pipeline worker"):
+                await asyncio.wait_for(imager.start(), WITHIN_S)
+            await asyncio.sleep(0.1)
+        finally:
+            await imager.close()
+
+    asyncio.run(scenario())
+    assert losses == []
+
+
+def test_a_request_that_cannot_be_sent_is_not_left_pending(worker):
+    async def scenario(imager):
+        with pytest.raises((pickle.PicklingError, AttributeError)):
+            imager.submit(lambda: None, lambda _answer: None)
+        assert imager.pending == 0
+
+    run(lambda: WorkerImager(SETUP, worker(ANSWERING)), scenario)
+
+
+def test_a_thread_whose_pipeline_cannot_be_made_reports_it(monkeypatch):
+    def fail(_setup):
+        raise ValueError("odd\ncamera")
+
+    monkeypatch.setattr("starhil.emulator.sensor.pipeline.pipeline.make_pipeline", fail)
+
+    async def scenario():
+        imager = WorkerImager(SETUP, WorkerThread())
+        try:
+            with pytest.raises(EmulatorError, match="ValueError: odd camera"):
+                await asyncio.wait_for(imager.start(), WITHIN_S)
+        finally:
+            await imager.close()
+
+    asyncio.run(scenario())

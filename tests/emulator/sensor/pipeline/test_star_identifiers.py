@@ -1,0 +1,176 @@
+"""The identifier in force answers while another is made beside it."""
+
+import threading
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sensor.pipeline.messages import FrameRequest, PipelineSetup
+from starhil.emulator.sensor.pipeline.pipeline import Pipeline
+from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
+from starhil.emulator.truth.source import ZERO_RATE, TruthState
+from starid.attitude import Attitude
+from starid.camera import DEFAULT_CAMERA
+from starid.errors import StaridError
+
+DEEP = StarIdentifierSetup("geometric", DEFAULT_CAMERA, 1.0, (("limiting_magnitude", 6.0),))
+SHALLOW = replace(DEEP, options=(("limiting_magnitude", 5.0),))
+WIDE = replace(DEEP, margin=2.0)
+WITHIN_S = 60.0
+ACCURACY_ARCSEC = 20.0
+
+
+@dataclass
+class Made:
+    """Stands for an identifier."""
+
+    choice: StarIdentifierSetup
+
+
+class Factory:
+    """Makes what stands for identifiers: at once, or when it is let go."""
+
+    def __init__(self) -> None:
+        self.made: list[StarIdentifierSetup] = []
+        self.go = threading.Event()
+        self.go.set()
+        self.ended = threading.Semaphore(0)
+
+    def __call__(self, choice):
+        assert self.go.wait(WITHIN_S)
+        self.made.append(choice)
+        try:
+            if dict(choice.options)["limiting_magnitude"] < 0.0:
+                raise StaridError("too few stars")
+            return Made(choice)
+        finally:
+            self.ended.release()
+
+    def wait_for_thread(self) -> None:
+        assert self.ended.acquire(timeout=WITHIN_S)
+        for thread in threading.enumerate():
+            if thread.name == "identifier":
+                thread.join(WITHIN_S)
+
+
+@pytest.fixture
+def factory():
+    return Factory()
+
+
+@pytest.fixture
+def beside(factory):
+    """Star identifiers with the deep one in force, the factory held."""
+    identifiers = StarIdentifiers(factory, in_background=True)
+    assert identifiers.get(DEEP) == (Made(DEEP), True)  # the first is waited for
+    factory.ended.acquire()
+    factory.go.clear()
+    return identifiers
+
+
+def test_the_old_one_answers_until_the_new_one_is_ready(factory, beside):
+    for _ in range(3):
+        assert beside.get(SHALLOW) == (Made(DEEP), False)
+    factory.go.set()
+    factory.wait_for_thread()
+    assert beside.get(SHALLOW) == (Made(SHALLOW), True)
+    assert factory.made == [DEEP, SHALLOW]
+
+
+def test_only_the_last_wish_is_made_after_the_one_under_way(factory, beside):
+    assert beside.get(SHALLOW) == (Made(DEEP), False)
+    assert beside.get(WIDE) == (Made(DEEP), False)
+    factory.go.set()
+    factory.wait_for_thread()
+    assert beside.get(WIDE) == (Made(SHALLOW), False)
+    factory.wait_for_thread()
+    assert beside.get(WIDE) == (Made(WIDE), True)
+
+
+def test_one_built_at_once_discards_the_build_in_the_background(factory, beside):
+    assert beside.get(SHALLOW) == (Made(DEEP), False)
+    factory.go.set()
+    assert beside.build(WIDE) == Made(WIDE)
+    factory.wait_for_thread()
+    factory.wait_for_thread()
+    assert beside.get(WIDE) == (Made(WIDE), True)
+
+
+def test_returning_to_the_current_solver_takes_no_time(factory, beside):
+    assert beside.get(SHALLOW) == (Made(DEEP), False)
+    assert beside.get(DEEP) == (Made(DEEP), True)
+    factory.go.set()
+
+
+def test_a_solver_that_cannot_be_made_is_rejected_until_another_is_requested(factory, beside):
+    impossible = replace(DEEP, options=(("limiting_magnitude", -1.0),))
+    assert beside.get(impossible) == (Made(DEEP), False)
+    factory.go.set()
+    factory.wait_for_thread()
+    for _ in range(2):
+        with pytest.raises(StaridError, match="too few stars"):
+            beside.get(impossible)
+    assert factory.made == [DEEP, impossible]
+    assert beside.get(DEEP) == (Made(DEEP), True)
+
+
+def test_without_a_thread_each_one_is_waited_for(factory):
+    identifiers = StarIdentifiers(factory, in_background=False)
+    for choice in (DEEP, SHALLOW, SHALLOW, DEEP):
+        assert identifiers.get(choice) == (Made(choice), True)
+    assert factory.made == [DEEP, SHALLOW, DEEP]
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "option", "value", "said"),
+    [
+        (
+            "geometric",
+            "nonsense",
+            1,
+            r"identifier\.nonsense: not an option of the algorithm geometric; known: blend_px, cache",
+        ),
+        ("geometric", "catalog", 1, "not an option"),
+        ("geometric", "blend_px", "x", r"identifier\.blend_px: must be float, not 'x'"),
+        ("geometric", "blend_px", True, "must be float, not True"),
+        ("lsi", "neighbours", 2.5, "must be int, not 2.5"),
+        ("lsi", "solver", 3, "must be str, not 3"),
+        ("rsi", "limiting_magnitude", "x", "must be float, not 'x'"),
+    ],
+)
+def test_an_option_that_the_algorithm_does_not_have_is_named(algorithm, option, value, said):
+    with pytest.raises(EmulatorError, match=said):
+        StarIdentifierSetup(algorithm, DEFAULT_CAMERA, 1.0, ((option, value),)).make(None)
+
+
+def test_frames_are_solved_while_another_index_is_built_and_then_the_new_limit_holds():
+    setup = PipelineSetup(
+        camera={"fov_deg": 42.0}, sensor={}, sky={}, identifier={"cache": False}, catalog_path="", epoch=2026.0,
+        algorithm="geometric", seed=1, build_in_background=True,
+    )  # fmt: skip
+    pipeline = Pipeline(setup)
+    magnitude = dict(zip(pipeline.catalog.hip.tolist(), pipeline.catalog.v.tolist(), strict=True))
+    truth = Attitude.from_radec_roll(83.8, -1.2, 0.0)
+    asked = FrameRequest(0, TruthState(truth, ZERO_RATE), 0.1, 1.0)
+    bright = replace(asked, settings=replace(asked.settings, limiting_magnitude=4.0))
+
+    def solve(request):
+        result = pipeline.handle(request)
+        assert result.valid, result
+        error = Attitude(np.array(result.quaternion_xyzw)).error_to(truth)
+        assert error.cross_boresight_arcsec < ACCURACY_ARCSEC
+        return result
+
+    before = solve(asked)
+    assert not before.index_pending
+    meanwhile = solve(bright)
+    assert meanwhile.index_pending
+    assert meanwhile.matched == before.matched
+    begin = time.monotonic()
+    while (after := solve(bright)).index_pending:
+        assert time.monotonic() - begin < WITHIN_S
+    assert after.matched < before.matched
+    assert max(magnitude[star.hip] for star in after.stars) <= 4.0

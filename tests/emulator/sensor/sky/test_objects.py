@@ -1,0 +1,298 @@
+"""What else is in the field: it shows where it should, hides what it should, and is written in the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sensor.renderer import Renderer, SensorModel
+from starhil.emulator.sensor.sky.light import AreaPainter
+from starhil.emulator.sensor.sky.light_grid import Backdrop
+from starhil.emulator.sensor.sky.objects import (
+    EarthLimb,
+    Moon,
+    Obstruction,
+    PointSource,
+    SkyObjects,
+    SunGlare,
+    icrs_vector,
+)
+from starid.attitude import Attitude
+from starid.camera import DEFAULT_CAMERA, Camera
+from starid.catalog import load_catalog
+from starid.imaging.detection import detect
+
+ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
+
+
+@pytest.fixture(scope="module")
+def renderer() -> Renderer:
+    return Renderer(DEFAULT_CAMERA, load_catalog(), SensorModel(bits=12), seed=1)
+
+
+def place(ra_deg: float, dec_deg: float) -> np.ndarray:
+    xy, _ = DEFAULT_CAMERA.project(ORION.to_sensor(icrs_vector(ra_deg, dec_deg)[None, :]))
+    return xy[0]
+
+
+def mean_around(image: np.ndarray, xy: np.ndarray, half: int = 2) -> float:
+    x, y = np.rint(xy).astype(int)
+    return float(np.median(image[y - half : y + half + 1, x - half : x + half + 1]))
+
+
+def test_the_moon_saturates_hides_and_glares(renderer: Renderer) -> None:
+    plain = renderer.render(ORION)
+    rigel = plain.stars.hip == 24436
+    frame = renderer.render(ORION, objects=SkyObjects(moon=Moon(78.63, -8.2)))
+    assert mean_around(frame.image, plain.stars.xy_px[rigel][0]) == renderer.sensor.max_dn
+    assert not frame.stars.visible[frame.stars.hip == 24436][0]
+    near, far = place(80.6, -8.2), place(95.0, -8.2)
+    glare = [mean_around(frame.image, xy) - mean_around(plain.image, xy) for xy in (near, far)]
+    assert glare[0] > 10.0 * max(glare[1], 1.0)
+    radius_px = 0.26 / np.degrees(DEFAULT_CAMERA.pixel_scale_rad)
+    disc = renderer.render(ORION, objects=SkyObjects(moon=Moon(70.0, -12.0, glare_share=0.0))).image
+    x, y = np.rint(place(70.0, -12.0)).astype(int)
+    full = np.count_nonzero(disc[y - 15 : y + 16, x - 15 : x + 16] == renderer.sensor.max_dn)
+    # the spot's wings saturate as well, some 2 to 4 pixels beyond the limb
+    assert np.pi * (radius_px + 1.0) ** 2 < full < np.pi * (radius_px + 5.0) ** 2
+
+
+def test_the_lit_limb_points_in_the_given_direction(renderer: Renderer) -> None:
+    """North is up and east is left: a limb at position angle 90° (east) lights the left half."""
+    objects = SkyObjects(
+        moon=Moon(83.8, -1.2, diameter_deg=4.0, magnitude=-6.5, illuminated=0.5, glare_share=0.0)
+    )
+    image = renderer.render(ORION, objects=objects).image.astype(np.float64)
+    x, y = np.rint(place(83.8, -1.2)).astype(int)
+    left, right = image[y - 20 : y + 21, x - 20].mean(), image[y - 20 : y + 21, x + 20].mean()
+    assert left > right + 20.0
+
+
+def test_the_sun_brightens_the_side_where_it_is(renderer: Renderer) -> None:
+    image = renderer.render(ORION, objects=SkyObjects(sun=SunGlare(83.8, 40.0, 2000.0))).image
+    top, bottom = np.median(image[:50]), np.median(image[-50:])
+    offset = renderer.sensor.offset_dn
+    assert top - offset > 4.0 * (bottom - offset)
+
+
+@pytest.mark.parametrize("off_deg", [2.0, 20.0])
+def test_the_sun_in_the_field_saturates_the_image(renderer: Renderer, off_deg: float) -> None:
+    frame = renderer.render(ORION, objects=SkyObjects(sun=SunGlare(83.8, -1.2 + off_deg)))
+    assert np.mean(frame.image == renderer.sensor.max_dn) > 0.999  # the rest are dead
+
+
+def test_a_short_exposure_shows_the_disc_of_the_sun(renderer: Renderer) -> None:
+    sun = SunGlare(83.8, -1.2)
+    short = renderer.with_sensor(renderer.sensor.with_(aperture_m=1e-4, transmission=1e-3))
+    image = short.render(ORION, objects=SkyObjects(sun=sun), exposure_s=5e-5).image.astype(np.float64)
+    light = image - short.sensor.offset_dn
+    half_px = np.sqrt(np.count_nonzero(light > 0.5 * np.median(light[466:471, 466:471])) / np.pi)
+    assert half_px == pytest.approx(0.2665 / np.degrees(DEFAULT_CAMERA.pixel_scale_rad), abs=0.5)
+
+
+@pytest.mark.parametrize("electrons_s", [0.0, 2e6])
+def test_the_earth_covers_stars_behind_it(renderer: Renderer, electrons_s: float) -> None:
+    earth = EarthLimb(83.8, -70.0, radius_deg=64.0, electrons_s=electrons_s)
+    frame = renderer.render(ORION, objects=SkyObjects(earth=earth))
+    vectors = DEFAULT_CAMERA.back_project(frame.stars.xy_px)
+    distance = np.degrees(np.arccos(vectors @ ORION.to_sensor(icrs_vector(83.8, -70.0))))
+    assert not np.any(frame.stars.visible[distance < 63.9])
+    assert np.all(frame.stars.visible[distance > 64.4])
+    assert frame.objects is not None
+    assert 0.2 < frame.objects.covered_share < 0.6
+    below = np.median(frame.image[-40:])
+    assert below == renderer.sensor.max_dn if electrons_s else below <= np.median(frame.image[:40])
+
+
+@pytest.mark.parametrize("sun", [None, (60.0, 20.0), (150.0, -40.0)])
+@pytest.mark.parametrize("radius_deg", [64.0, 20.0])
+def test_a_wide_earth_matches_a_computation_per_pixel(
+    radius_deg: float, sun: tuple[float, float] | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Within 1.2 % of full daylight and 0.8 % of the stars' light of the computation pixel by pixel, up to the limb."""
+    camera = Camera.from_fov(20.0, width=440, height=440)
+    lit = {} if sun is None else {"sun_ra_deg": sun[0], "sun_dec_deg": sun[1]}
+    earth = EarthLimb(83.8, -1.0 - radius_deg, radius_deg=radius_deg, atmosphere_deg=0.2, **lit)
+    objects = SkyObjects(earth=earth, sun=SunGlare(83.8, 60.0, 2000.0))
+    flat = np.ones((camera.height, camera.width), dtype=np.float32)
+    ones = flat.astype(np.uint16)
+    pixels = np.argwhere(flat)[::97, ::-1].astype(np.float64)
+
+    def painted(wide_from_deg: float) -> tuple[np.ndarray, np.ndarray, float]:
+        monkeypatch.setattr("starhil.emulator.sensor.sky.light._WIDE_EARTH_DEG", wide_from_deg)
+        light = AreaPainter(camera, 1.8e6, 0.8).paint(objects, ORION)
+        assert (light.earth is None) == (wide_from_deg > radius_deg)
+        mean = np.zeros_like(flat)
+        light.draw(mean, Backdrop(flat, ones, 1.0, 0 * ones, 0.0, sky_e_s=1.0, exposure_s=1.0))
+        return mean, light.seen_at(pixels), light.covered_share
+
+    mean, visible, share = painted(0.0)
+    expected, expected_visible, expected_share = painted(90.0)
+    np.testing.assert_allclose(mean, expected, atol=0.012 * earth.electrons_s)
+    np.testing.assert_allclose(visible, expected_visible, atol=0.008)
+    assert share == pytest.approx(expected_share, abs=0.02)
+    assert 0.3 < share < 0.7
+
+
+def test_glare_around_a_source_in_the_field_matches_a_computation_per_pixel(renderer: Renderer) -> None:
+    """Within 0.5 electrons, 4 % of the read noise, of strength/(chord² + softness²) in every pixel."""
+    camera, moon = DEFAULT_CAMERA, Moon(80.0, 2.0, magnitude=-12.7)
+    light = AreaPainter(camera, renderer.sensor.zero_magnitude_e_s, 0.8).paint(SkyObjects(moon=moon), ORION)
+    zero = np.zeros((camera.height, camera.width), dtype=np.float32)
+    mean, ones = zero.copy(), np.ones(zero.shape, dtype=np.uint16)
+    light.draw(mean, Backdrop(zero, ones, 1.0, 0 * ones, 0.0, sky_e_s=0.0, exposure_s=0.2))
+    x, y = np.meshgrid(np.arange(0, 937, 3), np.arange(0, 937, 3))
+    seen = camera.back_project(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
+    chord2 = np.sum((seen - ORION.to_sensor(icrs_vector(80.0, 2.0))) ** 2, axis=1)
+    total = renderer.sensor.electrons(-12.7, 0.2) * moon.glare_share * camera.pixel_scale_rad**2
+    expected = total / (2.0 * np.pi * np.log(100.0)) / (chord2 + np.radians(0.3) ** 2)
+    outside = chord2 > np.radians(0.8) ** 2
+    np.testing.assert_allclose(mean[y.ravel(), x.ravel()][outside], expected[outside], atol=0.5)
+
+
+def test_a_straight_edge_covers_the_share_asked_for(renderer: Renderer) -> None:
+    frame = renderer.render(ORION, objects=SkyObjects(obstructions=(Obstruction(0.3, 180.0),)))
+    assert frame.objects is not None
+    assert frame.objects.covered_share == pytest.approx(0.3, abs=0.01)
+    edge = 0.3 * 937
+    assert not np.any(frame.stars.visible[frame.stars.xy_px[:, 0] < edge - 10.0])
+    assert np.all(frame.stars.visible[frame.stars.xy_px[:, 0] > edge + 10.0])
+
+
+def test_a_polygon_covers_its_inside(renderer: Renderer) -> None:
+    corners = ((100.0, 100.0), (600.0, 100.0), (600.0, 500.0), (100.0, 500.0))
+    frame = renderer.render(ORION, objects=SkyObjects(obstructions=(Obstruction(polygon_px=corners),)))
+    xy = frame.stars.xy_px
+    inside = np.all((xy > [110.0, 110.0]) & (xy < [590.0, 490.0]), axis=1)
+    outside = np.any((xy < [90.0, 90.0]) | (xy > [610.0, 510.0]), axis=1)
+    assert not np.any(frame.stars.visible[inside])
+    assert np.all(frame.stars.visible[outside])
+
+
+def test_false_stars_move_and_fixed_ones_stay(renderer: Renderer) -> None:
+    objects = SkyObjects(false_stars=20, fixed_false_stars=10)
+    frames = [renderer.render(ORION, frame_index=index, objects=objects) for index in range(2)]
+    first, second = (frame.objects.false_xy_px for frame in frames if frame.objects is not None)
+    np.testing.assert_array_equal(first[:10], second[:10])
+    assert np.abs(first[10:] - second[10:]).min() > 1e-6
+    found = detect(frames[0].image, renderer.sensor.detection_settings())
+    gaps = np.linalg.norm(first[:, None] - found.xy_px[None], axis=2).min(axis=1)
+    assert np.count_nonzero(gaps < 0.3) >= 28
+
+
+def test_missing_stars_are_the_brightest(renderer: Renderer) -> None:
+    frame = renderer.render(ORION, objects=SkyObjects(missing_stars=3))
+    assert not np.any(frame.stars.visible[:3])
+    assert np.all(frame.stars.visible[3:])
+    sky = np.median(frame.image)
+    for xy in frame.stars.xy_px[:3]:
+        assert mean_around(frame.image, xy) < sky + 15.0
+
+
+def test_planets_are_points_at_their_directions(renderer: Renderer) -> None:
+    planets = (PointSource(83.0, 3.0, -2.0, "Jupiter"), PointSource(270.0, 60.0, 1.0, "Saturn"))
+    frame = renderer.render(ORION, objects=SkyObjects(planets=planets))
+    assert frame.objects is not None
+    assert frame.objects.planet_xy_px[0] == pytest.approx(place(83.0, 3.0))
+    assert np.all(np.isnan(frame.objects.planet_xy_px[1]))
+    found = detect(frame.image, renderer.sensor.detection_settings())
+    assert np.linalg.norm(found.xy_px - place(83.0, 3.0), axis=1).min() < 0.1
+
+
+def test_particles_leave_streaks_at_their_true_positions(renderer: Renderer) -> None:
+    frame = renderer.render(ORION, objects=SkyObjects(cosmic_rays_s=200.0))
+    plain = renderer.render(ORION)
+    assert frame.objects is not None
+    streaks = frame.objects.cosmic_rays_px
+    assert 15 <= len(streaks) <= 70
+    middles = 0.5 * (streaks[:, :2] + streaks[:, 2:])
+    middles = middles[np.all((middles > 5.0) & (middles < 930.0), axis=1)]
+    brighter = [mean_around(frame.image, xy, 0) > mean_around(plain.image, xy, 0) + 50.0 for xy in middles]
+    assert np.mean(brighter) > 0.9
+
+
+def test_a_blank_sky_has_no_light(renderer: Renderer) -> None:
+    frame = renderer.render(ORION, objects=SkyObjects(blank=True))
+    assert not np.any(frame.stars.visible)
+    found = detect(frame.image, renderer.sensor.detection_settings())
+    assert len(found) == 0
+    assert found.reason
+
+
+def test_an_obstruction_of_the_whole_image_lets_no_light_in(renderer: Renderer) -> None:
+    covered = renderer.render(ORION, objects=SkyObjects(obstructions=(Obstruction(1.0),)))
+    assert covered.image.tobytes() == renderer.render(ORION, objects=SkyObjects(blank=True)).image.tobytes()
+
+
+def test_objects_do_not_change_the_noise_stream(renderer: Renderer) -> None:
+    plain = renderer.render(ORION)
+    nothing = renderer.render(ORION, objects=SkyObjects())
+    assert plain.image.tobytes() == nothing.image.tobytes()
+
+
+def test_plain_values_make_the_same_objects() -> None:
+    made = SkyObjects.from_dict(
+        {
+            "moon": {"ra_deg": 10, "dec_deg": 5.0},
+            "planets": [{"ra_deg": 1.0, "dec_deg": 2.0, "magnitude": -1.0}],
+            "obstructions": [{"polygon_px": [[0, 0], [10, 0], [0, 10]]}],
+            "blocked_share": 0.5,
+            "false_star_magnitudes": [2, 4],
+            "missing_stars": 3,
+        }
+    )
+    assert made == SkyObjects(
+        moon=Moon(10, 5.0),
+        planets=(PointSource(1.0, 2.0, -1.0),),
+        obstructions=(Obstruction(polygon_px=((0, 0), (10, 0), (0, 10))), Obstruction(0.5)),
+        false_star_magnitudes=(2, 4),
+        missing_stars=3,
+    )
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"comet": {}}, "unknown key 'comet'"),
+        ({"moon": {"ra_deg": 1.0}}, "sky moon: key 'dec_deg' is missing"),
+        ({"moon": {"ra_deg": 1.0, "dec_deg": 95.0}}, "dec_deg: must be a number -90…90, not 95.0"),
+        ({"moon": 3}, "sky moon: must be a table, not 3"),
+        ({"planets": 4}, "sky planets: must be a list of tables"),
+        ({"false_stars": 1.5}, "false_stars: must be a whole number 0…100000, not 1.5"),
+        ({"false_stars": -1}, "false_stars: must be a whole number 0…100000, not -1"),
+        ({"false_star_magnitudes": [5, 1]}, "put the brighter one first"),
+        ({"false_star_magnitudes": "bright"}, "must be two numbers"),
+        ({"blocked_share": 1.5}, "share: must be a number 0…1, not 1.5"),
+        ({"obstructions": [{"polygon_px": [1, 2]}]}, "polygon_px"),
+        (
+            {"obstructions": [{"polygon_px": [["a", "b"], [1, 2], [3, 4]]}]},
+            "polygon_px: must be a number -100000…100000, not 'a'",
+        ),
+        (
+            {"obstructions": [{"polygon_px": [[True, 0], [1, 2], [3, 4]]}]},
+            "polygon_px: must be a number -100000…100000, not True",
+        ),
+        (
+            {"obstructions": [{"polygon_px": [[float("nan"), 0], [1, 2], [3, 4]]}]},
+            "polygon_px: must be a number -100000…100000, not nan",
+        ),
+        (
+            {"obstructions": [{"polygon_px": [[1e200, 0], [1, 2], [3, 4]]}]},
+            "polygon_px: must be a number -100000…100000, not 1e+200",
+        ),
+        ({"moon": {"ra_deg": 10**400, "dec_deg": 0.0}}, "ra_deg: must be a number -360…360, not 1000"),
+        ({"moon": {"ra_deg": float("inf"), "dec_deg": 0.0}}, "ra_deg: must be a number -360…360, not inf"),
+        ({"blocked_share": ""}, "share: must be a number 0…1, not ''"),
+        ({"blank": "no"}, "blank: must be true or false, not 'no'"),
+        (
+            {"planets": [{"ra_deg": 1.0, "dec_deg": 2.0, "magnitude": 1.0, "name": 3}]},
+            "name: must be a string, not 3",
+        ),
+    ],
+)
+def test_bad_objects_are_rejected_in_one_line(values: dict[str, object], text: str) -> None:
+    with pytest.raises(EmulatorError) as caught:
+        SkyObjects.from_dict(values)
+    assert text in str(caught.value)
+    assert "\n" not in str(caught.value)
