@@ -113,7 +113,7 @@ def made_by() -> dict[str, str]:
     import starid
 
     emulator = Path(__file__).parent.parent
-    rooms = ("sky", "sensor", "pipeline", "benchmarks")
+    rooms = ("sensor", "benchmarks")
     roots = (Path(starid.__file__).parent, *(emulator / room for room in rooms))
     digest = hashlib.sha256()
     for root in roots:
