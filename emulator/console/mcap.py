@@ -22,7 +22,7 @@ from typing import Any, Final
 from mcap.writer import CompressionType, Writer
 
 from starhil.emulator.console.history import COLUMNS, MODES, UNITS, History, json_row
-from starhil.emulator.console.obc import POLL_S, ObcClient, decode
+from starhil.emulator.console.obc import POLL_S, ObcConnection, decode
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
 from starhil.emulator.links.traffic import Decoder, WireItem
@@ -97,7 +97,7 @@ INFO: Final = 2
 class McapRecorder:
     """Records a run. Log times are simulation time since `run.start_unix_s`, whatever the device's clock shows."""
 
-    def __init__(self, head: Head, client: ObcClient, path: Path, *, overwrite: bool = False) -> None:
+    def __init__(self, head: Head, client: ObcConnection, path: Path, *, overwrite: bool = False) -> None:
         self._head = head
         self._client = client
         self._history = History(1)

@@ -50,7 +50,7 @@ class Exchange:
     refused: bool = False
 
 
-class ObcClient(Protocol):
+class ObcConnection(Protocol):
     """An OBC on a link to the device."""
 
     async def start(self) -> None:
@@ -86,7 +86,7 @@ class ObcPort:
     dialect: Callable[[], Dialect | None]
 
 
-MakeClient = Callable[[ObcPort], ObcClient]
+MakeClient = Callable[[ObcPort], ObcConnection]
 """Makes the OBC for a port."""
 
 
@@ -112,7 +112,7 @@ class ConsoleObc:
     """
 
     def __init__(
-        self, client: ObcClient, icd: InterfaceDefinition, clock: Callable[[], float] = time.monotonic
+        self, client: ObcConnection, icd: InterfaceDefinition, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.client = client
         self._icd = icd

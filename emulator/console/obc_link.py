@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
-from starhil.emulator.console.obc import Bus, MakeClient, ObcClient, ObcPort
+from starhil.emulator.console.obc import Bus, MakeClient, ObcConnection, ObcPort
 from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
@@ -13,7 +13,7 @@ from starhil.emulator.run.head import Head
 from starhil.protocol.icd import InterfaceDefinition
 
 
-async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[], object]]) -> ObcClient:
+async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[], object]]) -> ObcConnection:
     """Open an OBC on the CAN bus of the run, or on a separate link if the run has no CAN bus.
 
     Parameters
