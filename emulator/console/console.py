@@ -14,7 +14,7 @@ from starhil.emulator.console.describe import describe, load_bright_stars
 from starhil.emulator.console.history import History, frame_message, json_row
 from starhil.emulator.console.obc import POLL_S, ConsoleObc, Exchange, ObcConnection
 from starhil.emulator.console.pointing import pointing_request
-from starhil.emulator.console.runs import Runs
+from starhil.emulator.console.reported_runs import ReportedRuns
 from starhil.emulator.console.stepping import StepRunner
 from starhil.emulator.console.trace import RequestEncoder, WireTrace
 from starhil.emulator.console.viewer import Viewer
@@ -49,7 +49,9 @@ LOOKS: Final = frozenset({"subscribe", "encode", "parameters"})
 class Console:
     """Server side of the pages of a head."""
 
-    def __init__(self, run: Run, head: Head, client: ObcConnection, stepping: StepRunner, runs: Runs) -> None:
+    def __init__(
+        self, run: Run, head: Head, client: ObcConnection, stepping: StepRunner, runs: ReportedRuns
+    ) -> None:
         self._run = run
         self._head = head
         device = head.device

@@ -198,11 +198,11 @@ class Emulator:
                 recorder.start()
         if self.options.view != "off":
             from starhil.emulator.console.console import Console
-            from starhil.emulator.console.runs import Runs
+            from starhil.emulator.console.reported_runs import ReportedRuns
             from starhil.emulator.console.server import ConsoleServer
             from starhil.emulator.console.stepping import StepRunner
 
-            stepping, runs = StepRunner(control.execute), Runs()
+            stepping, runs = StepRunner(control.execute), ReportedRuns()
             self._closers.append(stepping.pause)
             consoles = []
             for head, client in zip(self.run.heads, clients, strict=True):

@@ -11,7 +11,7 @@ from unittest.mock import patch
 
 from starhil.emulator.console.console import Console
 from starhil.emulator.console.obc import Exchange
-from starhil.emulator.console.runs import Runs
+from starhil.emulator.console.reported_runs import ReportedRuns
 from starhil.emulator.console.server import ConsoleServer
 from starhil.emulator.console.stepping import StepRunner
 from starhil.emulator.console.viewer import Viewer
@@ -133,7 +133,7 @@ ASKED = [
 
 def console_of(run_: _Loop) -> Console:
     """Return the console of a run."""
-    return Console(run_.run, run_.run.heads[0], _Obc(), StepRunner(run_.control.execute), Runs())
+    return Console(run_.run, run_.run.heads[0], _Obc(), StepRunner(run_.control.execute), ReportedRuns())
 
 
 @target("console", lambda: request_edits(len(ASKED)))

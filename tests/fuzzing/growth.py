@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from starhil.emulator.cli.fmu.process import PACKET, _unpacked
-from starhil.emulator.console.runs import Runs
+from starhil.emulator.console.reported_runs import ReportedRuns
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.truth.feed import LiveFeed, _Datagrams
 from starhil.emulator.truth.live import LiveTruth
@@ -233,7 +233,7 @@ def channels() -> dict[str, Channel]:
     """Return every channel by name; each logs nothing."""
     run_ = _Loop()
     run_.loop.set_default_executor(ThreadPoolExecutor(2, initializer=partial(sys.setprofile, _count)))
-    console, viewer, runs = console_of(run_), Viewer(_Socket()), Runs()
+    console, viewer, runs = console_of(run_), Viewer(_Socket()), ReportedRuns()
     for name in ("starhil.truth", "starhil.control"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
 

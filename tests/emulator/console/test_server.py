@@ -13,7 +13,7 @@ import pytest
 from starhil.emulator.console import server
 from starhil.emulator.console.console import Console
 from starhil.emulator.console.history import COLUMNS, MODES
-from starhil.emulator.console.runs import Runs
+from starhil.emulator.console.reported_runs import ReportedRuns
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
 from starhil.emulator.errors import EmulatorError
 from starhil.hil_tests.errors import BenchError
@@ -490,7 +490,7 @@ def test_a_result_with_very_much_traffic_is_reported_with_its_last_lines(run):
 
 def test_results_of_any_size_are_kept_in_bounded_memory():
     """A peer may send 2000 results of a megabyte in each of 20 runs."""
-    runs = Runs()
+    runs = ReportedRuns()
     texts = dict.fromkeys(("id", "name", "link", "detail", "unknown"), "x" * 50_000)
     for name in "ab":
         runs.report({"event": "begin", "run": name, "planned": 10**400})

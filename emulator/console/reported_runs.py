@@ -33,7 +33,7 @@ KEPT_LOGS: Final = 50
 
 
 @dataclass
-class Run:
+class ReportedRun:
     """A run: its description and its results so far."""
 
     run: str
@@ -64,13 +64,13 @@ class Run:
             del self.logs.popleft()["log"]
 
 
-class Runs:
+class ReportedRuns:
     """The latest runs."""
 
     def __init__(self) -> None:
         self.changed: Final = Signal[dict[str, Any]]("runs")
         """Messages for pages."""
-        self._runs: OrderedDict[str, Run] = OrderedDict()
+        self._runs: OrderedDict[str, ReportedRun] = OrderedDict()
 
     def report(self, event: object) -> None:
         """Record a report of a run: its begin, a result or its end."""
@@ -90,7 +90,7 @@ class Runs:
 
     def _begin_run(self, event: dict[str, Any]) -> None:
         planned = event.get("planned")
-        run = Run(
+        run = ReportedRun(
             run=str(event["run"])[:80],
             kind=str(event.get("kind", ""))[:40],
             title=str(event.get("title", ""))[:200],
@@ -112,7 +112,7 @@ class Runs:
         run.add(kept)
         self.changed.emit({"type": "result", "run": run.run, "counts": run.counts, "result": kept})
 
-    def _find(self, event: dict[str, Any]) -> Run:
+    def _find(self, event: dict[str, Any]) -> ReportedRun:
         run = self._runs.get(str(event["run"]))
         if run is None:
             raise EmulatorError("report: unknown run; report its begin first")
