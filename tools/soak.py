@@ -44,9 +44,9 @@ from aiohttp import ClientSession, ClientWebSocketResponse
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BenchError, DeviceError
-from starhil.hil_tests.rig.bench import LinkOptions
 from starhil.hil_tests.rig.control import ControlClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, hub_command
+from starhil.hil_tests.rig.rig import LinkOptions
 from starhil.hil_tests.session import SessionRequest, run_session
 from starhil.hil_tests.timing.figures import percentile
 

@@ -39,8 +39,8 @@ def command(
     SIGHUP end the session and the emulator that it started; the remaining steps are reported as not run, and
     the exit status is 128 plus the signal's number.
     """
-    from starhil.hil_tests.rig.bench import LinkOptions
     from starhil.hil_tests.rig.interruption import interruptible
+    from starhil.hil_tests.rig.rig import LinkOptions
     from starhil.hil_tests.session import SessionRequest, run_session
 
     links = LinkOptions(

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.reports import FAILED, PASSED, SKIPPED
-from starhil.hil_tests.rig.bench import Bench
 from starhil.hil_tests.rig.interruption import Interrupted
+from starhil.hil_tests.rig.rig import Rig
 from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.results import SessionResult, StepResult
 from starhil.hil_tests.session.script import Script
@@ -19,7 +19,7 @@ from starhil.protocol.errors import ProtocolError
 
 def run_steps(
     script: Script,
-    bench: Bench,
+    rig: Rig,
     folder: Path,
     *,
     on_result: Callable[[StepResult], None] = lambda _result: None,
@@ -33,9 +33,9 @@ def run_steps(
     if truth_path is None and script.truth.file is not None:
         truth_path = folder / script.truth.file
     truth = script.truth.attitude if truth_path is None else TruthLogReader(truth_path)
-    session = Session(bench, folder, truth)
+    session = Session(rig, folder, truth)
     begin = time.monotonic()
-    planned = script.planned(bench.links)
+    planned = script.planned(rig.links)
     results: list[StepResult] = []
     interruption = None
 
@@ -61,11 +61,11 @@ def run_steps(
 
 def _run_step(session: Session, number: int, step: Step, link: str) -> StepResult:
     begin = session.step_begin_s = time.monotonic()
-    links = session.bench.links
+    links = session.rig.links
     if link and link not in links:
         detail = f"needs a {link} link, the session has {' and '.join(links)}"
         return StepResult(number, step.name, link, SKIPPED, detail, 0.0)
-    for log in session.bench.logs.values():
+    for log in session.rig.logs.values():
         log.note(f"step {number}: {step.name}")
     attempt = Attempt()
     for turn in range(step.repeat):

@@ -14,11 +14,11 @@ from rich.text import Text
 
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError
 from starhil.hil_tests.reports import FAILED, PASSED, SKIPPED, prepare_report, write_junit
-from starhil.hil_tests.rig.bench import Bench, LinkOptions
 from starhil.hil_tests.rig.console_feed import RunFeed, console_address
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, pointed
 from starhil.hil_tests.rig.interruption import Interrupted
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
+from starhil.hil_tests.rig.rig import LinkOptions, Rig
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
 from starhil.hil_tests.session.results import SessionResult, StepResult, junit_cases
 from starhil.hil_tests.session.script import Script, load_script
@@ -87,9 +87,9 @@ def run_session(request: SessionRequest) -> SessionResult:
     result: SessionResult | None = None
     try:
         with ExitStack() as stack:
-            bench = _open_bench(request, script, options, icd, folder, stack)
-            show = _shown_on_console(request.view, script, bench, stack, show)
-            result = run_steps(script, bench, folder, on_result=show, truth_path=request.truth)
+            rig = _open_bench(request, script, options, icd, folder, stack)
+            show = _shown_on_console(request.view, script, rig, stack, show)
+            result = run_steps(script, rig, folder, on_result=show, truth_path=request.truth)
         if all(step.status == SKIPPED for step in result.results) and result.interruption is None:
             result = _failed(result, "at least one step runs", "every step is skipped", show)
     except EmulatorProcessError as error:
@@ -141,7 +141,7 @@ def _open_bench(
     icd: InterfaceDefinition,
     folder: Path,
     stack: ExitStack,
-) -> Bench:
+) -> Rig:
     """Open the bench with its links, and start the emulator if requested."""
     emulator = None
     if request.start:
@@ -149,23 +149,23 @@ def _open_bench(
             options = replace(options, can=stack.enter_context(private_can_bus()))
         state = stack.enter_context(temporary_folder("starhil-session-"))
         emulator = _emulator(request, script, options, folder, state)
-    bench = stack.enter_context(Bench(options, icd, emulator=emulator, log_folder=folder))
+    rig = stack.enter_context(Rig(options, icd, emulator=emulator, log_folder=folder))
     if emulator is not None:
         emulator.check_unit(request.unit)
-    for link in bench.links:
-        bench.client(link)  # report a missing port before the first step
-    return bench
+    for link in rig.links:
+        rig.client(link)  # report a missing port before the first step
+    return rig
 
 
 def _shown_on_console(
-    view: str | None, script: Script, bench: Bench, stack: ExitStack, show: Callable[[StepResult], None]
+    view: str | None, script: Script, rig: Rig, stack: ExitStack, show: Callable[[StepResult], None]
 ) -> Callable[[StepResult], None]:
     """Return a function that shows a result, also on the console if there is one."""
     if view is None:
         return show
-    address = console_address(view, bench.emulator)
-    unit = ", ".join(f"{link} {getattr(bench.options, link)}" for link in bench.links)
-    planned = len(script.planned(bench.links))
+    address = console_address(view, rig.emulator)
+    unit = ", ".join(f"{link} {getattr(rig.options, link)}" for link in rig.links)
+    planned = len(script.planned(rig.links))
     feed = stack.enter_context(
         RunFeed(address, kind="session", title=script.title, unit=unit, planned=planned)
     )

@@ -24,7 +24,7 @@ from starhil.hil_tests.client.images import write_png
 from starhil.hil_tests.client.raw_traffic import matches, parse_frame, pattern, send_and_listen
 from starhil.hil_tests.client.transactions import Ack, Reading
 from starhil.hil_tests.errors import BenchError, NackError
-from starhil.hil_tests.rig.bench import Bench
+from starhil.hil_tests.rig.rig import Rig
 from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.expect import (
     AttitudeCheck,
@@ -159,7 +159,7 @@ Link = Literal["serial", "can", "both"]
 class Session:
     """What the steps of a session share."""
 
-    bench: Bench
+    rig: Rig
     folder: Path
     """Gets CSV and image files."""
     truth: Quaternion | TruthLogReader | None
@@ -286,7 +286,7 @@ class Step(Keys):
             attempt.detail = " ".join(f"{name}={show(reading[name])}" for name in self.expect)
         if self.attitude is not None and not problems:
             truth = self.attitude.attitude or session.truth_of(reading)
-            error, problem = self.attitude.judge(reading.values, truth, session.bench.icd.conventions)
+            error, problem = self.attitude.judge(reading.values, truth, session.rig.icd.conventions)
             if error is not None:
                 attempt.figures.update(vars(error))
                 attempt.detail += f" error: {show_angle(error.cross_boresight_arcsec)} cross, {show_angle(error.roll_arcsec)} roll"
@@ -350,7 +350,7 @@ class Command(RequestStep):
             variables = session.variables
             values = {name: resolve(value, variables) for name, value in self.values.items()}
             data = self.row.encode(values, check=self.refused is None)
-        return self.exchange(session.bench.client(link).command_raw, self.row.name, data)[0]
+        return self.exchange(session.rig.client(link).command_raw, self.row.name, data)[0]
 
 
 class ReadingStep(Step):
@@ -372,7 +372,7 @@ class Read(ReadingStep, RequestStep):
 
     def run(self, session: Session, link: str) -> Attempt:
         """Read the row."""
-        attempt, reading = self.exchange(session.bench.client(link).read, self.row.name)
+        attempt, reading = self.exchange(session.rig.client(link).read, self.row.name)
         return attempt if reading is None or attempt.problem else self.judged(session, reading)
 
 
@@ -390,7 +390,7 @@ class Listen(ReadingStep):
 
     def run(self, session: Session, link: str) -> Attempt:
         """Judge the next messages since the begin of the step that no earlier attempt has judged."""
-        client = session.bench.client(link)
+        client = session.rig.client(link)
         attempt = Attempt()
         times: list[float] = []
         for _ in range(self.count):
@@ -429,7 +429,7 @@ class Sample(ReadingStep):
 
     def run(self, session: Session, link: str) -> Attempt:
         """Read the row for some time; write the values, and judge each reading."""
-        client = session.bench.client(link)
+        client = session.rig.client(link)
         name = self.file or f"{self.row.name}.csv"
         fields = list(self.row.named_fields)
         latencies: list[float] = []
@@ -492,7 +492,7 @@ class SetParameter(RequestStep):
 
     def run(self, session: Session, link: str) -> Attempt:
         """Set the parameter; if it must be accepted, read it back."""
-        client, name = session.bench.client(link), self.parameter.name
+        client, name = session.rig.client(link), self.parameter.name
         value = resolve(self.value, session.variables)
         attempt, ack = self.exchange(client.set_parameter, name, value, checked=self.refused is None)
         if ack is not None and self.refused is None:
@@ -524,7 +524,7 @@ class GetParameter(Step):
 
     def run(self, session: Session, link: str) -> Attempt:
         """Read the parameter."""
-        return self.judged(session, session.bench.client(link).read_parameter(self.parameter.name))
+        return self.judged(session, session.rig.client(link).read_parameter(self.parameter.name))
 
 
 class DownloadImage(Step):
@@ -538,7 +538,7 @@ class DownloadImage(Step):
 
     def run(self, session: Session, link: str) -> Attempt:
         """Download the image; a blank one is a problem."""
-        image = session.bench.client(link).download_image(self.size, method=self.method)
+        image = session.rig.client(link).download_image(self.size, method=self.method)
         write_png(session.folder / self.file, image.pixels, image.width, image.height)
         figures = {
             "seconds": image.seconds,
@@ -570,7 +570,7 @@ class Send(Step):
     def run(self, session: Session, link: str) -> Attempt:
         """Send the data and compare what comes back."""
         wanted = self.answer or []
-        client = session.bench.client(link)
+        client = session.rig.client(link)
         listening = send_and_listen(client.core, self.data, self.listen_s, wanted, self.timeout_s)
         seen = client.run(listening)
         shown = ", ".join(text for text in seen if text) or "nothing"
@@ -606,7 +606,7 @@ class Restart(Step):
 
     def run(self, session: Session, link: str) -> Attempt:  # noqa: ARG002 -- no link
         """Restart the emulator."""
-        session.bench.restart(self.signal)
+        session.rig.restart(self.signal)
         return Attempt(detail="ready again")
 
 
@@ -621,7 +621,7 @@ class Control(Step):
 
     def run(self, session: Session, link: str) -> Attempt:  # noqa: ARG002 -- no link
         """Send the request."""
-        return Attempt(detail=json.dumps(session.bench.control(self.action, self.keys)))
+        return Attempt(detail=json.dumps(session.rig.control(self.action, self.keys)))
 
 
 ACTIONS: Final[Mapping[str, type[Step]]] = {

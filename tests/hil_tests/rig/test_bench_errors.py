@@ -15,9 +15,9 @@ from starhil.hil_tests.client.canopen_link import CanopenHostLink
 from starhil.hil_tests.client.raw_traffic import pattern
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.rig import emulator_process
-from starhil.hil_tests.rig.bench import Bench, LinkOptions
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command, parse_ready_line
 from starhil.hil_tests.rig.interruption import Interrupted, interruptible
+from starhil.hil_tests.rig.rig import LinkOptions, Rig
 from starhil.hil_tests.rig.truth_log import QUATERNION_COLUMNS, TIME_COLUMN, TruthLogReader
 from starhil.hil_tests.timing.realtime import set_realtime_priority
 from starhil.protocol.can.frame import CanFrame
@@ -206,9 +206,9 @@ def test_a_priority_that_is_not_permitted_is_reported(monkeypatch):
 
 def test_a_link_that_the_emulator_did_not_open_is_reported():
     process = emulator("import signal, sys; signal.signal(15, lambda *_: sys.exit(0))", READY, FOREVER)
-    bench = Bench(LinkOptions(serial="auto", can="auto"), ICD, emulator=process)
-    with bench, pytest.raises(BenchError, match="the emulator did not open a can link; its ready line has"):
-        bench.client("can")
+    rig = Rig(LinkOptions(serial="auto", can="auto"), ICD, emulator=process)
+    with rig, pytest.raises(BenchError, match="the emulator did not open a can link; its ready line has"):
+        rig.client("can")
 
 
 @pytest.mark.parametrize("text", ["1F 7", "XY", "123#0", "#00"])

@@ -12,8 +12,8 @@ from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, ru
 from starhil.hil_tests.conformance.report import write_html_report, write_junit_report
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.reports import prepare_report, write_junit, write_report
-from starhil.hil_tests.rig.bench import Bench, LinkOptions
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess
+from starhil.hil_tests.rig.rig import LinkOptions, Rig
 from starhil.protocol.unit import load_unit
 
 READY = "import sys, time; print('ready serial=none', flush=True); "
@@ -31,8 +31,8 @@ def emulator(text: str) -> EmulatorProcess:
     return EmulatorProcess([sys.executable, "-c", text])
 
 
-def bench(text: str) -> Bench:
-    return Bench(LinkOptions(serial="auto"), load_unit(), emulator=emulator(text))
+def rig(text: str) -> Rig:
+    return Rig(LinkOptions(serial="auto"), load_unit(), emulator=emulator(text))
 
 
 def wait_for_its_end(process: EmulatorProcess, error: Exception | None = None) -> None:
@@ -45,7 +45,7 @@ def wait_for_its_end(process: EmulatorProcess, error: Exception | None = None) -
 
 @pytest.mark.process
 def test_an_emulator_that_ended_unexpectedly_is_reported_with_its_last_errors():
-    with pytest.raises(EmulatorProcessError, match=LAST_ERRORS), bench(DIES) as own:
+    with pytest.raises(EmulatorProcessError, match=LAST_ERRORS), rig(DIES) as own:
         wait_for_its_end(own.emulator)
     assert own.emulator.process.stdout.closed
     assert own.emulator.process.stderr.closed
@@ -62,14 +62,14 @@ def test_the_progress_of_a_slow_start_is_shown_without_other_messages(capfd):
 
 @pytest.mark.process
 def test_the_end_of_an_emulator_is_the_reason_of_later_errors():
-    with pytest.raises(EmulatorProcessError, match=LAST_ERRORS), bench(DIES) as own:
+    with pytest.raises(EmulatorProcessError, match=LAST_ERRORS), rig(DIES) as own:
         wait_for_its_end(own.emulator, BenchError("no reply"))
 
 
 @pytest.mark.process
 @pytest.mark.parametrize("text", [DIES, LASTS])
 def test_another_error_is_not_hidden_by_it(text):
-    with pytest.raises(ZeroDivisionError), bench(text) as own:
+    with pytest.raises(ZeroDivisionError), rig(text) as own:
         wait_for_its_end(own.emulator, ZeroDivisionError())
     assert not own.emulator.running
     assert own.emulator.process.stderr.closed
@@ -77,7 +77,7 @@ def test_another_error_is_not_hidden_by_it(text):
 
 @pytest.mark.process
 def test_an_end_that_a_restart_has_reported_is_not_reported_again():
-    with bench(DIES) as own:
+    with rig(DIES) as own:
         wait_for_its_end(own.emulator)
         with pytest.raises(EmulatorProcessError, match=LAST_ERRORS):
             own.restart("term")

@@ -17,8 +17,8 @@ from starhil.emulator.cli.app import build_app
 from starhil.emulator.profile import load_profile
 from starhil.hil_tests.attitude import attitude_error, from_radec_roll, unit
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.rig.bench import Bench, LinkOptions
 from starhil.hil_tests.rig.interruption import Interrupted
+from starhil.hil_tests.rig.rig import LinkOptions, Rig
 from starhil.hil_tests.session import SessionRequest, run_session
 from starhil.hil_tests.session.results import junit_cases
 from starhil.hil_tests.session.script import load_script
@@ -49,8 +49,8 @@ def play(device, tmp_path):
         path.write_text("[defaults]\ntimeout_s = 5\nkeep_going = true\n" + text, encoding="utf-8")
         script = load_script(path, ICD)
         options = LinkOptions(serial=port, can=can, timeout_s=script.defaults.timeout_s)
-        with Bench(options, ICD, log_folder=tmp_path) as bench:
-            return run_steps(script, bench, tmp_path)
+        with Rig(options, ICD, log_folder=tmp_path) as rig:
+            return run_steps(script, rig, tmp_path)
 
     return _play
 
@@ -63,13 +63,13 @@ def test_listen_checks_only_messages_after_its_start(device, hub, tmp_path):
     )
     script = load_script(path, ICD)
     pause = threading.Event()
-    with Bench(LinkOptions(can=device.open_can(hub), timeout_s=20.0), ICD) as bench:
+    with Rig(LinkOptions(can=device.open_can(hub), timeout_s=20.0), ICD) as rig:
         for number in range(50):  # they pile up before the step
             device.say("precise_attitude", {"frame_counter": number})
-        bench.client("can").read("rates")
+        rig.client("can").read("rates")
         for number in range(50):
             device.say("precise_attitude", {"frame_counter": number})
-        bench.client("can").read("rates")
+        rig.client("can").read("rates")
 
         def send() -> None:
             for number in range(100, 200):
@@ -80,7 +80,7 @@ def test_listen_checks_only_messages_after_its_start(device, hub, tmp_path):
         sender = threading.Thread(target=send)
         sender.start()
         try:
-            (result,) = run_steps(script, bench, tmp_path).results
+            (result,) = run_steps(script, rig, tmp_path).results
         finally:
             pause.set()
             sender.join()
@@ -158,8 +158,8 @@ def test_passing_steps_pass_and_failing_steps_give_the_reason(play, device):
 def test_after_a_failed_step_the_rest_is_skipped_without_keep_going(device, tmp_path):
     path = tmp_path / "s.toml"
     path.write_text("[[step]]\nread = 'rates'\nexpect = { rate_x = 9 }\n[[step]]\nread = 'rates'\n")
-    with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
-        result = run_steps(load_script(path, ICD), bench, tmp_path)
+    with Rig(LinkOptions(serial=device.open_serial()), ICD) as rig:
+        result = run_steps(load_script(path, ICD), rig, tmp_path)
     assert [item.status for item in result.results] == ["failed", "skipped"]
 
 
@@ -174,8 +174,8 @@ def test_finished_steps_keep_their_result_when_a_signal_comes_as_one_is_shown(de
         if len(shown) == moment + 1:
             raise Interrupted(signal.SIGTERM)
 
-    with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
-        result = run_steps(load_script(path, ICD), bench, tmp_path, on_result=show)
+    with Rig(LinkOptions(serial=device.open_serial()), ICD) as rig:
+        result = run_steps(load_script(path, ICD), rig, tmp_path, on_result=show)
     assert [item.status for item in result.results] == ["passed"] * (moment + 1) + ["skipped"] * (2 - moment)
     assert result.results[-1].detail == "not run: interrupted by SIGTERM"
     assert result.interruption is not None
@@ -185,13 +185,13 @@ def test_finished_steps_keep_their_result_when_a_signal_comes_as_one_is_shown(de
 def test_a_signal_after_the_last_step_loses_no_result(device, tmp_path, monkeypatch):
     script, junit = tmp_path / "s.toml", tmp_path / "j.xml"
     script.write_text("[[step]]\nread = 'rates'\n")
-    close = Bench.close_clients
+    close = Rig.close_clients
 
-    def interrupted_close(bench):
-        close(bench)
+    def interrupted_close(rig):
+        close(rig)
         raise Interrupted(signal.SIGTERM)
 
-    monkeypatch.setattr(Bench, "close_clients", interrupted_close)
+    monkeypatch.setattr(Rig, "close_clients", interrupted_close)
     options = LinkOptions(serial=device.open_serial())
     result = run_session(SessionRequest(script, options=options, folder=tmp_path, junit=junit, quiet=True))
     assert [item.status for item in result.results] == ["passed"]
@@ -259,9 +259,9 @@ def test_a_truth_log_that_is_given_takes_the_place_of_the_truth_of_the_script(de
     device.telemetry["precise_attitude"] = attitude_values()
     rows = [f"{t}," + ",".join(map(repr, from_radec_roll(10.0, 20.0, 30.0))) for t in (100, 101)]
     log.write_text("\n".join(["time_of_exposure_s,true_qx,true_qy,true_qz,true_qw", *rows]))
-    with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
+    with Rig(LinkOptions(serial=device.open_serial()), ICD) as rig:
         for truth, status in ((None, "passed"), (log, "failed")):
-            result = run_steps(load_script(script, ICD), bench, tmp_path, truth_path=truth)
+            result = run_steps(load_script(script, ICD), rig, tmp_path, truth_path=truth)
             assert result.results[0].status == status
 
 
@@ -434,11 +434,11 @@ def test_one_unsolicited_message_is_judged_without_a_rate(device, hub, tmp_path,
         f"[[step]]\nlisten = 'precise_attitude'\nexpect = {{ frame_counter = {wanted} }}\n", encoding="utf-8"
     )
     script = load_script(path, ICD)
-    with Bench(LinkOptions(can=device.open_can(hub), timeout_s=20.0), ICD) as bench:
-        bench.client("can").read("rates")
+    with Rig(LinkOptions(can=device.open_can(hub), timeout_s=20.0), ICD) as rig:
+        rig.client("can").read("rates")
         timer = threading.Timer(0.2, device.say, ["precise_attitude", {"frame_counter": 7}])
         timer.start()
-        (result,) = run_steps(script, bench, tmp_path).results
+        (result,) = run_steps(script, rig, tmp_path).results
         timer.join()
     assert (result.status, "rate_hz" in result.figures) == (status, False), result.detail
 
@@ -464,11 +464,11 @@ def test_listen_takes_each_message_from_the_begin_of_the_step(device, hub, tmp_p
         for number in numbers:
             device.say("precise_attitude", {"frame_counter": number})
 
-    with Bench(LinkOptions(can=device.open_can(hub)), ICD) as bench:
-        bench.client("can").read("rates")
+    with Rig(LinkOptions(can=device.open_can(hub)), ICD) as rig:
+        rig.client("can").read("rates")
         timer = threading.Timer(0.5, say)
         timer.start()
-        (result,) = run_steps(load_script(path, ICD), bench, tmp_path).results
+        (result,) = run_steps(load_script(path, ICD), rig, tmp_path).results
         timer.join()
     assert result.status == "passed", result.detail
     assert result.seconds < 2.0
@@ -501,10 +501,10 @@ def test_only_an_emulator_that_the_session_started_can_be_restarted(play):
 
 def test_a_link_that_the_bench_lacks_is_rejected(device):
     with (
-        Bench(LinkOptions(serial=device.open_serial()), ICD) as bench,
+        Rig(LinkOptions(serial=device.open_serial()), ICD) as rig,
         pytest.raises(BenchError, match="no can link"),
     ):
-        bench.client("can")
+        rig.client("can")
 
 
 # --- the command ---

@@ -44,7 +44,7 @@ class LinkOptions:
         return tuple(name for name in ("serial", "can") if getattr(self, name) is not None)
 
 
-class Bench:
+class Rig:
     """Clients of one unit: a context manager that opens them on first use and closes them all.
 
     On exit it raises `EmulatorProcessError` if the emulator ended unexpectedly or does not end cleanly.
