@@ -45,7 +45,7 @@ def test_the_unit_of_the_page_has_no_errors_and_the_exchange_that_is_shown(tmp_p
 
 def test_the_client_of_the_page_prints_the_output_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "starhil.emulator.run.run.make_imager", lambda *_, **__: FakeImager(FakePipeline().handle)
+        "starhil.emulator.run.run.make_pipeline", lambda *_, **__: FakeImager(FakePipeline().handle)
     )
     profile = Profile.model_validate(
         {
@@ -104,7 +104,7 @@ def test_the_framing_of_the_page_carries_every_message(tmp_path):
 
 def test_the_unit_of_the_page_streams_by_itself(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "starhil.emulator.run.run.make_imager", lambda *_, **__: FakeImager(FakePipeline().handle)
+        "starhil.emulator.run.run.make_pipeline", lambda *_, **__: FakeImager(FakePipeline().handle)
     )
     folder = written(tmp_path / "lynx")
     (more,) = [block.text for block in blocks(PAGE, "toml") if block.heading == STREAMING]

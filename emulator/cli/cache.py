@@ -62,7 +62,7 @@ def warm(
     from starhil.emulator.device.parameters import Parameters, solver_settings
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
     from starhil.emulator.profile.pipeline_setup import pipeline_setup
-    from starhil.emulator.sensor.pipeline.imager import WorkerImager
+    from starhil.emulator.sensor.pipeline.client import WorkerClient
     from starhil.emulator.sensor.pipeline.messages import IndexRequest, camera_constants
     from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
     from starhil.protocol.unit import load_unit
@@ -76,7 +76,7 @@ def warm(
     setup = replace(setup, previews=True, sky={"bodies": "ephemeris"})  # these have kernels of their own
 
     async def start() -> None:
-        imager = WorkerImager(setup, WorkerProcess())
+        imager = WorkerClient(setup, WorkerProcess())
         progress = asyncio.create_task(report_slow_start())
         try:
             adopt_camera(parameters, loaded, camera_constants((await imager.start()).camera))

@@ -27,7 +27,7 @@ from starhil.emulator.device.rate import RateEstimator
 from starhil.emulator.device.signals import Signals
 from starhil.emulator.device.surroundings import Surroundings
 from starhil.emulator.profile import Profile
-from starhil.emulator.sensor.pipeline.imager import Imager, PipelineReply
+from starhil.emulator.sensor.pipeline.client import PipelineClient, PipelineReply
 from starhil.emulator.sensor.pipeline.messages import (
     ZERO,
     CatalogUpset,
@@ -79,7 +79,7 @@ class FrameCycle:
         self,
         profile: Profile,
         scheduler: Scheduler,
-        imager: Imager,
+        imager: PipelineClient,
         time: DeviceTime,
         parameters: Parameters,
         modes: Modes,

@@ -25,7 +25,7 @@ from starhil.emulator.device.subscriptions import Subscriptions
 from starhil.emulator.device.surroundings import Surroundings
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
-from starhil.emulator.sensor.pipeline.imager import Imager
+from starhil.emulator.sensor.pipeline.client import PipelineClient
 from starhil.emulator.sensor.pipeline.messages import IDENTITY, Quaternion
 from starhil.emulator.simulation.clock import NANOSECONDS, Clock, DeviceTime
 from starhil.emulator.simulation.guard import log_internal_error, one_line
@@ -82,7 +82,7 @@ class Device:
         profile: Profile,
         icd: InterfaceDefinition,
         clock: Clock,
-        imager: Imager,
+        imager: PipelineClient,
         store: StateStore,
         truth: TruthSource,
         background: Background = run_at_once,

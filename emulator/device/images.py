@@ -13,7 +13,7 @@ from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.signals import Signals
 from starhil.emulator.device.stored_images import ImageState, StoredImage
-from starhil.emulator.sensor.pipeline.imager import Imager, PipelineReply
+from starhil.emulator.sensor.pipeline.client import PipelineClient, PipelineReply
 from starhil.emulator.sensor.pipeline.messages import IMAGE_EDGES, ImageRequest, ImageResult
 from starhil.emulator.simulation.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.simulation.scheduler import Scheduler
@@ -29,7 +29,12 @@ class ImageStore:
     """Captures images, stores them and serves one for download."""
 
     def __init__(
-        self, scheduler: Scheduler, imager: Imager, cycle: FrameCycle, time: DeviceTime, signals: Signals
+        self,
+        scheduler: Scheduler,
+        imager: PipelineClient,
+        cycle: FrameCycle,
+        time: DeviceTime,
+        signals: Signals,
     ) -> None:
         self._scheduler = scheduler
         self._imager = imager

@@ -10,7 +10,7 @@
     faults ──faults_changed──► recording
 
 Two parts that do not depend on the device have signals elsewhere: `Scheduler.added` wakes a sleeping pump, and
-`PipelineImager.ended` starts the pipeline again.
+`SensorPipeline.ended` starts the pipeline again.
 
 The sender changes its own state before it reports. Observers are called in the order in which the parts were made:
 first the device, so that every other part finds it up to date.

@@ -34,7 +34,12 @@ from starhil.emulator.run.recorder import (
 )
 from starhil.emulator.run.truth_log import TruthLog
 from starhil.emulator.run.wiring import Wiring
-from starhil.emulator.sensor.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
+from starhil.emulator.sensor.pipeline.client import (
+    PipelineClient,
+    PipelineReply,
+    PipelineRequest,
+    ReplyCallback,
+)
 from starhil.emulator.sensor.pipeline.messages import PipelineEnded, PipelineReady
 from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock
 from starhil.emulator.simulation.guard import call_guarded
@@ -214,7 +219,7 @@ class Player(Wiring):
         """Items that the device has received and sent."""
         self.receivers: dict[str, Callable[[Any], None]] = {}
         """Function of each open link that takes its input."""
-        self.pipeline: PlayedImager | None = None
+        self.pipeline: PlayedPipeline | None = None
         self.writes: deque[Callable[[], None]] = deque()
         """Functions that end pending slow writes."""
         self._ends_at_once = ends_at_once
@@ -231,9 +236,9 @@ class Player(Wiring):
         """Keep an item that passes a link now, for the comparison."""
         self.passed.append(WireItem(self.stepped.now_ns() / NANOSECONDS, link, outgoing, item))
 
-    def imager(self, inner: Imager) -> Imager:
+    def imager(self, inner: PipelineClient) -> PipelineClient:
         """Return a pipeline whose replies wait for their entries."""
-        self.pipeline = PlayedImager(inner)
+        self.pipeline = PlayedPipeline(inner)
         return self.pipeline
 
     def background(self, inner: Background) -> Background:
@@ -276,10 +281,10 @@ class _PlayedSerial(_PlayedTransport[bytes], SerialTransport):
         """Take the bytes at any bit rate: they have their times on the tape."""
 
 
-class PlayedImager:
+class PlayedPipeline:
     """A pipeline whose replies wait for their entries."""
 
-    def __init__(self, inner: Imager) -> None:
+    def __init__(self, inner: PipelineClient) -> None:
         self._inner = inner
         self._arrived: deque[tuple[ReplyCallback, PipelineReply]] = deque()
         self.pending = 0
@@ -393,7 +398,7 @@ class _Playing:
     """Plays entries one by one."""
 
     def __init__(
-        self, run: Run, head: Head, player: Player, pipeline: PlayedImager, warm: PipelineReady
+        self, run: Run, head: Head, player: Player, pipeline: PlayedPipeline, warm: PipelineReady
     ) -> None:
         self.truth = run.truth
         self.head = head

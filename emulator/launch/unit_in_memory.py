@@ -23,8 +23,8 @@ from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.run.head import Head
 from starhil.emulator.run.pump import MAX_STEP_S
 from starhil.emulator.run.wiring import Wiring
-from starhil.emulator.sensor.pipeline.error_model import ErrorModelImager
-from starhil.emulator.sensor.pipeline.imager import WorkerImager
+from starhil.emulator.sensor.pipeline.client import WorkerClient
+from starhil.emulator.sensor.pipeline.error_model import ErrorModel
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock
 from starhil.emulator.truth.config import TruthConfig
@@ -271,10 +271,10 @@ class UnitUnderTest:
     async def end_pipeline(self) -> None:
         """End the image pipeline; a process is killed, and its successor awaited, which takes no simulation time."""
         imager, device = self.head.imager, self.head.device
-        if isinstance(imager, ErrorModelImager):
+        if isinstance(imager, ErrorModel):
             imager.end("pipeline: ended by an endurance run")
             return
-        if not isinstance(imager, WorkerImager) or not isinstance(imager.worker, WorkerProcess):
+        if not isinstance(imager, WorkerClient) or not isinstance(imager.worker, WorkerProcess):
             raise EmulatorError("endurance: the pipeline is in a thread, which cannot be ended")
         imager.worker.process.kill()
         for ready in (False, True):

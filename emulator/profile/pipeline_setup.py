@@ -5,27 +5,27 @@ from __future__ import annotations
 from typing import TypeAlias
 
 from starhil.emulator.profile.profile import Profile
-from starhil.emulator.sensor.pipeline.error_model import ErrorModelImager
-from starhil.emulator.sensor.pipeline.imager import WorkerImager
+from starhil.emulator.sensor.pipeline.client import WorkerClient
+from starhil.emulator.sensor.pipeline.error_model import ErrorModel
 from starhil.emulator.sensor.pipeline.messages import PipelineSetup
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess, WorkerThread
 
-PipelineImager: TypeAlias = WorkerImager | ErrorModelImager
+SensorPipeline: TypeAlias = WorkerClient | ErrorModel
 """An image pipeline that can be started, and started again after an unexpected end."""
 
 
-def make_imager(
+def make_pipeline(
     profile: Profile, worker: WorkerProcess | None, *, repeatable: bool, previews: bool
-) -> PipelineImager:
+) -> SensorPipeline:
     """Return the pipeline of a profile; a worker that was started earlier is used, or ended."""
     setup = pipeline_setup(profile, repeatable=repeatable, previews=previews)
     if profile.run.worker == "process":
-        return WorkerImager(setup, worker or WorkerProcess())
+        return WorkerClient(setup, worker or WorkerProcess())
     if worker is not None:
         worker.end()
     if profile.run.worker == "error_model":
-        return ErrorModelImager(setup)
-    return WorkerImager(setup, WorkerThread())
+        return ErrorModel(setup)
+    return WorkerClient(setup, WorkerThread())
 
 
 def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool = False) -> PipelineSetup:

@@ -32,7 +32,7 @@ from starhil.emulator.links.name_lock import lock_symlink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.links.traffic import Traffic
 from starhil.emulator.profile import Profile
-from starhil.emulator.profile.pipeline_setup import PipelineImager
+from starhil.emulator.profile.pipeline_setup import SensorPipeline
 from starhil.emulator.run.faults import Faults
 from starhil.emulator.run.pump import ClockPump
 from starhil.emulator.run.recorder import Recorder
@@ -64,7 +64,7 @@ class Head:
         number: int,
         profile: Profile,
         icd: InterfaceDefinition,
-        imager: PipelineImager,
+        imager: SensorPipeline,
         truth: Truth,
         wiring: Wiring,
         on_warm: Callable[[], None],

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.run.recorder import Recorder
-from starhil.emulator.sensor.pipeline.imager import Imager
+from starhil.emulator.sensor.pipeline.client import PipelineClient
 from starhil.emulator.simulation.clock import NANOSECONDS, Clock, LatchedClock, SteppedClock
 from starhil.emulator.simulation.guard import call_guarded
 from starhil.emulator.simulation.scheduler import Event, Scheduler
@@ -92,7 +92,7 @@ class StepPump:
 
     def __init__(
         self,
-        devices: Sequence[tuple[Scheduler, Imager]],
+        devices: Sequence[tuple[Scheduler, PipelineClient]],
         transports: Sequence[Transport[Any]],
         clock: SteppedClock,
         time_passes: asyncio.Event,

@@ -19,7 +19,12 @@ from typing import Any, Final, TypeVar
 from starhil.emulator.device.device import Background
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.run.wiring import Wiring
-from starhil.emulator.sensor.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
+from starhil.emulator.sensor.pipeline.client import (
+    PipelineClient,
+    PipelineReply,
+    PipelineRequest,
+    ReplyCallback,
+)
 from starhil.emulator.sensor.pipeline.messages import PipelineEnded
 from starhil.emulator.simulation.clock import LatchedClock, ScaledClock
 from starhil.emulator.simulation.output_file import Output, OutputFile
@@ -111,9 +116,9 @@ class Recorder(Wiring):
         """Return the transport of a CAN link, whose items are recorded."""
         return _RecordedTransport(self._inner.can(name, make), name, self)
 
-    def imager(self, inner: Imager) -> Imager:
+    def imager(self, inner: PipelineClient) -> PipelineClient:
         """Return a pipeline whose replies are recorded as entries."""
-        return _RecordedImager(self._inner.imager(inner), self)
+        return _RecordedPipeline(self._inner.imager(inner), self)
 
     def background(self, inner: Background) -> Background:
         """Return a function whose writes end with an entry, unless they end at once (stepped clock)."""
@@ -184,10 +189,10 @@ class _RecordedSerial(_RecordedTransport[bytes], SerialTransport):
         self._port.set_baud(baud)
 
 
-class _RecordedImager:
+class _RecordedPipeline:
     """A pipeline whose replies are recorded as entries."""
 
-    def __init__(self, inner: Imager, recorder: Recorder) -> None:
+    def __init__(self, inner: PipelineClient, recorder: Recorder) -> None:
         self._inner = inner
         self._recorder = recorder
 

@@ -14,7 +14,7 @@ from typing import Final
 
 from starhil.emulator.device.device import PIPELINE_ENDED, Device
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.profile.pipeline_setup import PipelineImager
+from starhil.emulator.profile.pipeline_setup import SensorPipeline
 from starhil.emulator.sensor.pipeline.messages import PipelineReady
 from starhil.emulator.simulation.guard import one_line
 
@@ -31,7 +31,7 @@ class PipelineRevival:
 
     def __init__(
         self,
-        imager: PipelineImager,
+        imager: SensorPipeline,
         device: Device,
         ready: Callable[[PipelineReady], None],
         record: Callable[[str], None],

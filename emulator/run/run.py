@@ -24,7 +24,7 @@ from typing import Any
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
-from starhil.emulator.profile.pipeline_setup import PipelineImager, make_imager
+from starhil.emulator.profile.pipeline_setup import SensorPipeline, make_pipeline
 from starhil.emulator.run.head import Head, check_links
 from starhil.emulator.run.pump import StepPump
 from starhil.emulator.run.recorder import Recorder
@@ -77,10 +77,10 @@ class Run:
         self.truth = Truth(self.profile.truth, self.profile.folder, host)
         units = [(profile, _unit_of(profile)) for profile in profiles]
         repeatable = self.wiring.repeatable
-        self._plans: list[tuple[Profile, InterfaceDefinition, PipelineImager]] = []
+        self._plans: list[tuple[Profile, InterfaceDefinition, SensorPipeline]] = []
         """Profile, unit and pipeline of each head that is not made yet."""
         for profile, icd in units:
-            imager = make_imager(profile, worker, repeatable=repeatable, previews=previews)
+            imager = make_pipeline(profile, worker, repeatable=repeatable, previews=previews)
             self._plans.append((profile, icd, imager))
             worker = None
 

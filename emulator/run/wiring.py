@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from starhil.emulator.device.device import Background
-from starhil.emulator.sensor.pipeline.imager import Imager
+from starhil.emulator.sensor.pipeline.client import PipelineClient
 from starhil.emulator.simulation.clock import Clock
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.transports.base import Transport
@@ -31,7 +31,7 @@ class Wiring:
         """Return the transport of a CAN link."""
         return make()
 
-    def imager(self, inner: Imager) -> Imager:
+    def imager(self, inner: PipelineClient) -> PipelineClient:
         """Return the pipeline for the device."""
         return inner
 

@@ -17,7 +17,7 @@ from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.profile import Profile
 from starhil.emulator.run.pump import ClockPump
-from starhil.emulator.sensor.pipeline.imager import PipelineReply, PipelineRequest
+from starhil.emulator.sensor.pipeline.client import PipelineReply, PipelineRequest
 from starhil.emulator.sensor.pipeline.messages import (
     FrameResult,
     ImageRequest,

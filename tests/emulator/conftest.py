@@ -17,7 +17,7 @@ from starhil.emulator.device.state_store import MemoryStore, StateStore
 from starhil.emulator.launch import Emulator, RunOptions
 from starhil.emulator.profile import Profile
 from starhil.emulator.sensor.pipeline import worker_process
-from starhil.emulator.sensor.pipeline.imager import PipelineReply, PipelineRequest
+from starhil.emulator.sensor.pipeline.client import PipelineReply, PipelineRequest
 from starhil.emulator.sensor.pipeline.messages import (
     FrameRequest,
     FrameResult,
@@ -203,7 +203,9 @@ def make_bench() -> Callable[..., Bench]:
 def run(monkeypatch, make_bench):
     """Run a scenario with an emulation that is started and ready."""
     pipeline = make_bench().pipeline
-    monkeypatch.setattr("starhil.emulator.run.run.make_imager", lambda *_, **__: FakeImager(pipeline.handle))
+    monkeypatch.setattr(
+        "starhil.emulator.run.run.make_pipeline", lambda *_, **__: FakeImager(pipeline.handle)
+    )
 
     def run(scenario, *, clock="stepped", options=None, others=(), ready_within_s=60.0, **overrides):
         def profile(keys):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from starhil.emulator.device.pending import PendingAnswer
-from starhil.emulator.sensor.pipeline.imager import PipelineReply, PipelineRequest, ReplyCallback
+from starhil.emulator.sensor.pipeline.client import PipelineReply, PipelineRequest, ReplyCallback
 from starhil.emulator.sensor.pipeline.messages import FrameRequest, IndexRequest, PipelineReady
 from starhil.emulator.simulation.signal import Signal
 from starhil.protocol.messages import ErrorCode, Request

@@ -40,7 +40,7 @@ def drawing():
 def opened(make_bench, monkeypatch):
     """Return what a function makes of a run with all links that has published a frame."""
     handle = make_bench().pipeline.handle
-    monkeypatch.setattr("starhil.emulator.run.run.make_imager", lambda *_, **__: FakeImager(handle))
+    monkeypatch.setattr("starhil.emulator.run.run.make_pipeline", lambda *_, **__: FakeImager(handle))
 
     def opened(look):
         links = {"serial": {"port": "auto"}, "can": {"channel": "virtual:drawn"}, "canopen": {"node": 5}}

@@ -31,7 +31,7 @@ class _Loop:
         self.loop = asyncio.new_event_loop()
         pipeline = FakePipeline()
         keys = {"run": {"clock": "stepped"}, "links": {"serial": {"port": "off"}, "can": {"channel": "off"}}}
-        with patch("starhil.emulator.run.run.make_imager", lambda *_, **__: FakeImager(pipeline.handle)):
+        with patch("starhil.emulator.run.run.make_pipeline", lambda *_, **__: FakeImager(pipeline.handle)):
             self.run = EmulatorRun([Profile.model_validate(keys)])
         self.call(self._start())
         self.control = ControlServer(self.run, lambda: None)

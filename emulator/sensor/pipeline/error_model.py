@@ -18,7 +18,7 @@ import math
 import random
 from typing import Any, Final
 
-from starhil.emulator.sensor.pipeline.imager import PipelineRequest, ReplyCallback
+from starhil.emulator.sensor.pipeline.client import PipelineRequest, ReplyCallback
 from starhil.emulator.sensor.pipeline.messages import (
     FrameRequest,
     FrameResult,
@@ -55,7 +55,7 @@ SMEAR_PX: Final = 3.0
 """Length of a trail at which the light per pixel is halved, pixels."""
 
 
-class ErrorModelImager:
+class ErrorModel:
     """The pipeline as an error model; requests are answered in the call that submits them.
 
     `end` ends it unexpectedly, like the death of a worker process.

@@ -66,7 +66,7 @@ def test_all_errors_are_printed_and_the_status_is_1(tmp_path):
 
 def test_a_profile_with_a_wrong_unit_starts_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "starhil.emulator.run.run.make_imager", lambda *_, **__: pytest.fail("the pipeline was started")
+        "starhil.emulator.run.run.make_pipeline", lambda *_, **__: pytest.fail("the pipeline was started")
     )
     unit("new", str(tmp_path / "mine"))
     profile = tmp_path / "profile.toml"
@@ -136,7 +136,7 @@ def test_a_bench_of_another_unit_than_the_profile_is_rejected():
 )
 def test_a_unit_without_the_links_that_are_asked_for_starts_nothing(monkeypatch, unit_, links, message):
     monkeypatch.setattr(
-        "starhil.emulator.run.run.make_imager", lambda *_, **__: pytest.fail("the pipeline was started")
+        "starhil.emulator.run.run.make_pipeline", lambda *_, **__: pytest.fail("the pipeline was started")
     )
     with pytest.raises(EmulatorError, match=message):
         Run([Profile.model_validate({"unit": unit_, "links": links})])
@@ -165,6 +165,6 @@ def test_the_load_of_the_links_is_refused_for_a_unit_without_its_rows():
 
 
 def test_a_link_that_the_unit_lacks_is_left_out_with_a_warning(monkeypatch, caplog):
-    monkeypatch.setattr("starhil.emulator.run.run.make_imager", lambda *_, **__: None)
+    monkeypatch.setattr("starhil.emulator.run.run.make_pipeline", lambda *_, **__: None)
     Run([Profile.model_validate({"unit": "sagitta", "links": {"can": {"channel": "vcan0"}}})])
     assert "links.can.channel: unit sagitta has no such link" in caplog.text

@@ -15,7 +15,7 @@ from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.profile.sections import RunConfig
 from starhil.emulator.run import Run
 from starhil.emulator.run.truth_log import COLUMNS
-from starhil.emulator.sensor.pipeline.imager import WorkerImager
+from starhil.emulator.sensor.pipeline.client import WorkerClient
 from starhil.emulator.sensor.pipeline.messages import PipelineReady
 from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.truth.file import read_truth_file
@@ -440,7 +440,7 @@ def test_a_pipeline_that_dies_is_reported_and_restarted():
             run.begin()
             await run.ready()
             emulation = FirstHead(run)
-            assert isinstance(emulation.imager, WorkerImager)
+            assert isinstance(emulation.imager, WorkerClient)
             await emulation.stepper.step(1.0)
             command(emulation, "set_mode", mode="lost_in_space")
             await emulation.stepper.step(2.0)

@@ -8,7 +8,7 @@ import pytest
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
 from starhil.emulator.profile.pipeline_setup import pipeline_setup
-from starhil.emulator.sensor.pipeline.imager import WorkerImager
+from starhil.emulator.sensor.pipeline.client import WorkerClient
 from starhil.emulator.sensor.pipeline.messages import (
     Failure,
     FrameResult,
@@ -40,7 +40,7 @@ class FakePipeline:
 
 
 @pytest.fixture(params=["process", "thread"])
-def make_imager(request, worker, monkeypatch):
+def make_pipeline(request, worker, monkeypatch):
     """Make an imager that answers with numbered frames and can be killed."""
     monkeypatch.setattr(
         "starhil.emulator.sensor.pipeline.pipeline.make_pipeline",
@@ -49,10 +49,10 @@ def make_imager(request, worker, monkeypatch):
 
     def make():
         if request.param == "process":
-            imager = WorkerImager(SETUP, worker(ANSWERING))
+            imager = WorkerClient(SETUP, worker(ANSWERING))
             imager.kill = lambda: imager.worker.process.kill()
         else:
-            imager = WorkerImager(SETUP, WorkerThread())
+            imager = WorkerClient(SETUP, WorkerThread())
             imager.kill = lambda: imager._writer.write(with_length(ImageRequest(0)))
         return imager
 
@@ -71,7 +71,7 @@ def run(imager_of, scenario):
     asyncio.run(whole())
 
 
-def test_a_callback_that_fails_is_logged_and_the_next_requests_are_answered(make_imager, caplog):
+def test_a_callback_that_fails_is_logged_and_the_next_requests_are_answered(make_pipeline, caplog):
     answers = []
 
     async def scenario(imager):
@@ -82,14 +82,14 @@ def test_a_callback_that_fails_is_logged_and_the_next_requests_are_answered(make
         await imager.settle()
         assert imager.pending == 0
 
-    run(make_imager, scenario)
+    run(make_pipeline, scenario)
     assert [answer.index for answer in answers] == [2, 3]
     (said,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
     assert "no_such_field" in said
     assert "\n" not in said
 
 
-def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_imager, caplog):
+def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_pipeline, caplog):
     answers, losses = [], []
 
     async def scenario(imager):
@@ -106,7 +106,7 @@ def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_i
         await imager.settle()
         assert isinstance(answers[-1], FrameResult)
 
-    run(make_imager, scenario)
+    run(make_pipeline, scenario)
     (said,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
     assert [said] == losses
 
@@ -122,11 +122,11 @@ def test_requests_fail_in_their_order_before_the_death_of_the_worker_is_noticed(
         await imager.settle()
 
     silent = f"{WORKER}send(PipelineReady({CAMERA}, 5, 0.0))\nreceive()\nreceive()\n"
-    run(lambda: WorkerImager(SETUP, worker(silent)), scenario)
+    run(lambda: WorkerClient(SETUP, worker(silent)), scenario)
     assert answers == [("first", PipelineEnded), ("second", PipelineEnded)]
 
 
-def test_a_failure_handler_that_fails_keeps_no_request_pending(make_imager, caplog):
+def test_a_failure_handler_that_fails_keeps_no_request_pending(make_pipeline, caplog):
     async def scenario(imager):
         imager.ended.connect(lambda _text: 1 / 0)
         imager.kill()
@@ -135,7 +135,7 @@ def test_a_failure_handler_that_fails_keeps_no_request_pending(make_imager, capl
         while "ZeroDivisionError" not in caplog.text:
             await asyncio.sleep(0.01)
 
-    run(make_imager, scenario)
+    run(make_pipeline, scenario)
 
 
 @pytest.mark.parametrize("bad", ["b'no pickle'", "pickle.dumps(PipelineReady)", "pickle.dumps(None) + b'x'"])
@@ -156,7 +156,7 @@ def test_an_answer_that_cannot_be_read_loses_the_worker_and_is_logged(worker, ca
         imager.submit(REQUEST, answers.append)
         assert isinstance(answers[-1], Failure)
 
-    run(lambda: WorkerImager(SETUP, worker(program)), scenario)
+    run(lambda: WorkerClient(SETUP, worker(program)), scenario)
     assert "cannot be read" in losses[0]
     assert "\n" not in losses[0]
 
@@ -173,7 +173,7 @@ def test_a_start_that_fails_raises_once_and_is_no_loss(worker, program):
     losses = []
 
     async def scenario():
-        imager = WorkerImager(SETUP, worker(program))
+        imager = WorkerClient(SETUP, worker(program))
         imager.ended.connect(losses.append)
         try:
             with pytest.raises(EmulatorError, match=r"no catalogue|pipeline worker"):
@@ -192,7 +192,7 @@ def test_a_request_that_cannot_be_sent_is_not_left_pending(worker):
             imager.submit(lambda: None, lambda _answer: None)
         assert imager.pending == 0
 
-    run(lambda: WorkerImager(SETUP, worker(ANSWERING)), scenario)
+    run(lambda: WorkerClient(SETUP, worker(ANSWERING)), scenario)
 
 
 def test_a_thread_whose_pipeline_cannot_be_made_reports_it(monkeypatch):
@@ -202,7 +202,7 @@ def test_a_thread_whose_pipeline_cannot_be_made_reports_it(monkeypatch):
     monkeypatch.setattr("starhil.emulator.sensor.pipeline.pipeline.make_pipeline", fail)
 
     async def scenario():
-        imager = WorkerImager(SETUP, WorkerThread())
+        imager = WorkerClient(SETUP, WorkerThread())
         try:
             with pytest.raises(EmulatorError, match="ValueError: odd camera"):
                 await asyncio.wait_for(imager.start(), WITHIN_S)

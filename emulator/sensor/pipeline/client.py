@@ -40,7 +40,7 @@ PipelineReply: TypeAlias = FrameResult | ImageResult | IndexReady | Failure
 ReplyCallback: TypeAlias = Callable[[PipelineReply], None]
 
 
-class Imager(Protocol):
+class PipelineClient(Protocol):
     """Interface of the image pipeline for the device."""
 
     @property
@@ -54,7 +54,7 @@ class Imager(Protocol):
         """Wait until no requests are pending."""
 
 
-class WorkerImager:
+class WorkerClient:
     """The pipeline in a worker, a process or a thread, connected by a socket pair.
 
     Numerics do not run in the emulator's process, so that its replies on the bus never wait for the interpreter lock,
