@@ -32,7 +32,7 @@ class Quaternion(NamedTuple):
 
 
 @dataclass(frozen=True)
-class AttitudeError:
+class AttitudeDifference:
     """How a measured attitude differs from the truth, in arcseconds, all non-negative.
 
     `cross_boresight_arcsec` is the angle between the two boresights, `roll_arcsec` the rotation about the
@@ -183,13 +183,13 @@ def to_radec_roll(q: Quaternion) -> tuple[float, float, float]:
     return math.degrees(ra) % 360.0, math.degrees(dec), roll % 360.0
 
 
-def attitude_error(measured: Quaternion, truth: Quaternion) -> AttitudeError:
+def attitude_error(measured: Quaternion, truth: Quaternion) -> AttitudeDifference:
     """Compare two attitudes; a quaternion and its negative are the same attitude."""
     x, y, z, w = product(measured, conjugate(truth))  # from the true into the measured sensor frame
     cross = 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w))
     total = 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
     roll = 2.0 * math.atan2(abs(z), abs(w))
-    return AttitudeError(cross * ARCSEC_PER_RAD, roll * ARCSEC_PER_RAD, total * ARCSEC_PER_RAD)
+    return AttitudeDifference(cross * ARCSEC_PER_RAD, roll * ARCSEC_PER_RAD, total * ARCSEC_PER_RAD)
 
 
 def interpolate(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:

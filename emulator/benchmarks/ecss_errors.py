@@ -1,6 +1,6 @@
 """Separation of attitude errors into the kinds of ECSS-E-ST-60-20C, from series that vary one influence at a time.
 
-An error is a rotation vector in the sensor frame (``starid.attitude.AttitudeError``): x and y are across the
+An error is a rotation vector in the sensor frame (``starid.attitude.AttitudeDifference``): x and y are across the
 boresight, z is about it. The main series has several sub-pixel positions for each field (direction in the sky),
 and several frames for each position, so that the error is
 

@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 from urllib.parse import urlsplit
 
 from starhil.hil_tests.attitude import (
-    AttitudeError,
+    AttitudeDifference,
     Quaternion,
     attitude_error,
     from_reported,
@@ -125,7 +125,7 @@ class Truth:
         keys = {} if unix_s is None else {"unix_s": unix_s}
         return unit(self._control.do("truth", **keys)["quaternion_xyzw"])
 
-    def error(self, quaternion_xyzw: list[float], unix_s: float) -> AttitudeError:
+    def error(self, quaternion_xyzw: list[float], unix_s: float) -> AttitudeDifference:
         """Return the error of an attitude as the unit reports it, measured at a time of the device's clock."""
         measured = from_reported(unit(quaternion_xyzw), self._conventions)
         return attitude_error(measured, self.attitude(unix_s))

@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from starhil.hil_tests.attitude import (
-    AttitudeError,
+    AttitudeDifference,
     Quaternion,
     attitude_error,
     from_radec_roll,
@@ -236,7 +236,7 @@ class AttitudeCheck(StatedAttitude):
 
     def judge(
         self, values: Mapping[str, Value], truth: Quaternion, conventions: Conventions
-    ) -> tuple[AttitudeError | None, str | None]:
+    ) -> tuple[AttitudeDifference | None, str | None]:
         """Return the error of the attitude in telemetry `values` of a unit with these conventions, and the problem or None."""
         try:
             measured = from_reported(measured_attitude(values), conventions)

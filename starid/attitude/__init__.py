@@ -3,7 +3,7 @@
 from starid.attitude.attitude import (
     ARCSEC_PER_RAD,
     Attitude,
-    AttitudeError,
+    AttitudeDifference,
     interpolate,
     propagate,
     quaternion_of,
@@ -15,7 +15,7 @@ from starid.attitude.attitude import (
 __all__ = [
     "ARCSEC_PER_RAD",
     "Attitude",
-    "AttitudeError",
+    "AttitudeDifference",
     "interpolate",
     "propagate",
     "quaternion_of",

@@ -43,7 +43,7 @@ _SMALL_TURN: Final = 1e-4
 
 
 @dataclass(frozen=True)
-class AttitudeError:
+class AttitudeDifference:
     """Difference between two attitudes.
 
     Attributes
@@ -229,7 +229,7 @@ class Attitude:
         turn = (k * vx, k * vy, k * vz, math.cos(0.5 * angle))
         return Attitude(_multiply(turn, self.quaternion_xyzw.tolist()))
 
-    def error_to(self, truth: Attitude) -> AttitudeError:
+    def error_to(self, truth: Attitude) -> AttitudeDifference:
         """Error of this attitude against the truth, split into cross-boresight and roll."""
         tx, ty, tz, tw = truth.quaternion_xyzw.tolist()
         x, y, z, w = _multiply(self.quaternion_xyzw.tolist(), (-tx, -ty, -tz, tw)).tolist()
@@ -240,7 +240,7 @@ class Attitude:
         half_sine = math.sqrt(x * x + y * y + z * z)
         total = 2.0 * math.atan2(half_sine, w)
         k = -2.0 if half_sine < _SMALL_ANGLE else -total / half_sine
-        return AttitudeError(
+        return AttitudeDifference(
             cross_boresight_arcsec=cross * ARCSEC_PER_RAD,
             roll_arcsec=roll * ARCSEC_PER_RAD,
             total_arcsec=total * ARCSEC_PER_RAD,
