@@ -9,7 +9,7 @@ from typing import Final
 from starhil.protocol.canopen.cob import LSS_SLAVE
 from starhil.protocol.canopen.context import UNCONFIGURED, Context, EventKind
 from starhil.protocol.canopen.storage import StorageError
-from starhil.protocol.canopen.store import ParameterStore
+from starhil.protocol.canopen.store_restore import StoreRestore
 
 LENGTH: Final = 8
 IDENTITY: Final = 0x1018
@@ -67,7 +67,7 @@ class LssSlave:
     def __init__(
         self,
         context: Context,
-        store: ParameterStore,
+        store: StoreRestore,
         on_node_id: Callable[[int], None],
         allowed_bit_rates: frozenset[int],
     ) -> None:

@@ -22,7 +22,7 @@ from starhil.protocol.canopen.lss import BIT_RATES, LssSlave
 from starhil.protocol.canopen.pdo import PdoService
 from starhil.protocol.canopen.sdo import SdoServer
 from starhil.protocol.canopen.storage import ParameterStorage
-from starhil.protocol.canopen.store import ApplicationStore, ParameterStore
+from starhil.protocol.canopen.store_restore import ApplicationStore, StoreRestore
 from starhil.protocol.canopen.sync import SyncService
 from starhil.protocol.canopen.timestamp import TimeConsumer
 from starhil.protocol.errors import ProtocolError
@@ -55,7 +55,7 @@ class CanopenSlave:
     bit_rates
         Bit rates that LSS may set, bit/s.
     on_save, on_restore
-        As in `ParameterStore`.
+        As in `StoreRestore`.
     on_reset
         Called to reset the application when NMT resets the node; a returned node ID applies unless LSS has
         stored one.
@@ -79,7 +79,7 @@ class CanopenSlave:
             raise ProtocolError(f"CANopen node ID {node_id}: must be 1 to 127, or 255 to wait for LSS")
         self.dictionary = dictionary
         self._context = context = Context(dictionary, node_id)
-        self.store = ParameterStore(
+        self.store = StoreRestore(
             context, ParameterStorage() if storage is None else storage, on_save, on_restore
         )
         self._default_node_id = node_id

@@ -25,7 +25,7 @@ ApplicationStore: TypeAlias = Callable[[], Deferred | None]
 """Stores the parameters of the application; a `Deferred` is answered when this is done."""
 
 
-class ParameterStore:
+class StoreRestore:
     """Saves the parameters of the communication profile across a restart, and restores the defaults.
 
     Those of the application are its own: `on_save` saves them and raises `SdoAbortError` on failure; `on_restore` resets
