@@ -37,7 +37,7 @@ from starhil.protocol.messages import (
     error_code,
 )
 from starhil.protocol.serial.framings import CUBESPACE, Escaped
-from starhil.protocol.serial.headers import Header
+from starhil.protocol.serial.headers import HeaderCodec
 
 
 class Dialect(StrEnum):
@@ -95,7 +95,7 @@ class DialectReplies:
     def __init__(self, dialect: Dialect) -> None:
         self._dialect = dialect
         self.headers: Final = {
-            kind: Header(models, "little", {}, {}, f"link.serial.{kind.value}")
+            kind: HeaderCodec(models, "little", {}, {}, f"link.serial.{kind.value}")
             for kind, models in REPLIES[dialect].items()
         }
         firsts = {kind: head.fields[0].const if head.fields else None for kind, head in self.headers.items()}

@@ -18,7 +18,7 @@ from starhil.protocol.icd.link_schema import FixedFraming, FramingModel, SerialL
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind
 from starhil.protocol.serial.checks import Check
 from starhil.protocol.serial.framings import BodySizeError, Deframer, Framing, Receiving
-from starhil.protocol.serial.headers import Envelope, Header, HeaderError
+from starhil.protocol.serial.headers import HeaderCodec, HeaderContent, HeaderError
 
 _Message = TypeVar("_Message")
 
@@ -31,7 +31,7 @@ class MessageFormat:
     model: FramingModel
     """Keys of the framing."""
     check: Check
-    header: Header
+    header: HeaderCodec
     classes: Sequence[str] = ()
 
     @cached_property
@@ -58,7 +58,7 @@ class MessageFormat:
             + (data if "data" in covers else b"")
         )
 
-    def open(self, body: bytes) -> tuple[Envelope, bytes] | LinkFault:
+    def open(self, body: bytes) -> tuple[HeaderContent, bytes] | LinkFault:
         """Return header and data of a body, or its fault."""
         header = self.header
         end = len(body) - self.check.size
@@ -99,7 +99,7 @@ class MessageFormat:
     def _bad_check(check: bytes) -> LinkFault:
         return LinkFault(FaultKind.UART_CHECK, f"check {check.hex().upper()} is wrong")
 
-    def measure(self, body: bytes, data_size: Callable[[Envelope], int]) -> int | None:
+    def measure(self, body: bytes, data_size: Callable[[HeaderContent], int]) -> int | None:
         """Return the size of the body that begins with these bytes, or None if more are needed.
 
         `data_size` returns the size of the data if the header carries no length. Raises BodySizeError.

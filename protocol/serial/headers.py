@@ -18,7 +18,7 @@ class HeaderError(ProtocolError):
     """A header that is invalid for this unit."""
 
 
-class Envelope(NamedTuple):
+class HeaderContent(NamedTuple):
     """Content of a header by role, and its size."""
 
     values: Mapping[str, int]
@@ -27,7 +27,7 @@ class Envelope(NamedTuple):
     """Name of the class, or an empty text."""
 
 
-class Header:
+class HeaderCodec:
     """The fields before the data of a message.
 
     `classes` are the names of the classes by code, `overhead` the sizes of `start`, `check` and `end`, which a length may
@@ -134,7 +134,7 @@ class Header:
     def _misfit(self, role: str | None, value: int, bits: int) -> HeaderError:
         return HeaderError(f"{self._where}: {role or 'constant'} {value} does not fit {bits} bits")
 
-    def unpack(self, body: bytes, klass: str = "") -> Envelope | None:
+    def unpack(self, body: bytes, klass: str = "") -> HeaderContent | None:
         """Decode the header of a body of a class, if that is known; return None if the body is too short.
 
         Raises HeaderError for a wrong constant or an unknown class.
@@ -163,9 +163,9 @@ class Header:
                     raise HeaderError(f"no class with code {values['class']}")
                 klass = self._classes[values["class"]]
             position = end
-        return Envelope(values, position, klass)
+        return HeaderContent(values, position, klass)
 
-    def data_size(self, envelope: Envelope) -> int:
+    def data_size(self, envelope: HeaderContent) -> int:
         """Return the data size according to the length in a header.
 
         Raises HeaderError if the length is less than the size of the other parts that it includes.

@@ -42,7 +42,7 @@ from starhil.protocol.serial.checks import build_check
 from starhil.protocol.serial.cubespace import Dialect, DialectReplies
 from starhil.protocol.serial.formats import Formats, MessageFormat, TextReplies, words
 from starhil.protocol.serial.framings import Deframer, Receiving, build_framing
-from starhil.protocol.serial.headers import Envelope, Header, HeaderError
+from starhil.protocol.serial.headers import HeaderCodec, HeaderContent, HeaderError
 
 LINK_FORMAT: Final = FormatModel()
 """The framing and check of the link itself."""
@@ -160,7 +160,7 @@ class SerialStack:
             for code in ((coded.code,) if name == "request_header" else (coded.reply_code, coded.unsolicited))
             if code is not None
         }
-        header = Header(models, self.byte_order, codes, overhead, f"link.serial.{name}")
+        header = HeaderCodec(models, self.byte_order, codes, overhead, f"link.serial.{name}")
         return MessageFormat(frames, framing, checks, header, item.classes or ())
 
     def in_dialect(self, dialect: Dialect | None) -> DialectReplies | None:
@@ -335,7 +335,7 @@ class SerialStack:
             return form.request_size
         return form.measure(body, self._request_data_size)
 
-    def _request_data_size(self, envelope: Envelope) -> int:
+    def _request_data_size(self, envelope: HeaderContent) -> int:
         row = self.icd.row(envelope.values["id"], envelope.klass)
         if row is None:
             raise HeaderError(f"no row with id {envelope.values['id']}")
@@ -401,7 +401,7 @@ class HostReceiver:
             pending if pending is not None and self._stack.reply_formats.of(pending.klass) is form else None
         )
 
-    def _data_size(self, form: MessageFormat, envelope: Envelope) -> int:
+    def _data_size(self, form: MessageFormat, envelope: HeaderContent) -> int:
         values = envelope.values
         if values.get("status", 0) or not values.get("ack", 1):
             return 0
@@ -469,7 +469,7 @@ class HostReceiver:
         self._pending = None
         return Reply(ReplyKind.ACK, pending.id, klass=pending.klass)
 
-    def _kind(self, envelope: Envelope, klass: str, row_id: int) -> ReplyKind:
+    def _kind(self, envelope: HeaderContent, klass: str, row_id: int) -> ReplyKind:
         values, stack = envelope.values, self._stack
         if values.get("status", 0) or not values.get("ack", 1):
             return ReplyKind.NACK
@@ -485,7 +485,7 @@ class HostReceiver:
         return reply
 
 
-def _class_of(envelope: Envelope, row_id: int, pending: Request | None) -> str:
+def _class_of(envelope: HeaderContent, row_id: int, pending: Request | None) -> str:
     """Return the class of a reply, or of the request that it answers if its header has none."""
     if not envelope.klass and pending is not None and pending.id == row_id:
         return pending.klass

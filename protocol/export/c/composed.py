@@ -21,7 +21,7 @@ from starhil.protocol.icd.link_schema import (
     XxHashCheck,
 )
 from starhil.protocol.serial.checks import reversed_bits
-from starhil.protocol.serial.headers import Header
+from starhil.protocol.serial.headers import HeaderCodec
 from starhil.protocol.serial.stack import SerialStack
 
 _MARKS: Final = 8
@@ -162,7 +162,7 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
     }
 
 
-def _length(header: Header) -> str:
+def _length(header: HeaderCodec) -> str:
     """Return the value of the length field in a header, as an expression."""
     sizes = {"header": "header", "data": "size"}
     sizes |= {part: str(size) for part, size in header.overhead.items()}

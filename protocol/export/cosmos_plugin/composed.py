@@ -10,7 +10,7 @@ from typing import Any, Final
 from starhil.protocol.export.packets import CLASS_SHIFT, check_one_format, row_key
 from starhil.protocol.export.templates import part_of, text_of
 from starhil.protocol.icd.link_schema import DelimitedFraming, EscapedFraming, NoCheck, SlipFraming
-from starhil.protocol.serial.headers import Header
+from starhil.protocol.serial.headers import HeaderCodec
 from starhil.protocol.serial.stack import SerialStack
 
 _NAMES: Final = {"init": "INITIAL", "poly": "POLYNOMIAL", "xor": "XOR_OUT"}
@@ -84,7 +84,7 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
     }
 
 
-def _fields(header: Header, codes: Mapping[str, int]) -> Iterator[dict[str, Any]]:
+def _fields(header: HeaderCodec, codes: Mapping[str, int]) -> Iterator[dict[str, Any]]:
     for field in header.fields:
         yield {
             "role": field.role,
