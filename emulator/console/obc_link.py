@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable
 
 from starhil.emulator.console.obc import Bus, MakeClient, ObcConnection, ObcPort
-from starhil.emulator.links.base import Link
+from starhil.emulator.links.base import AnyLink
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.run.head import Head
@@ -22,7 +22,7 @@ async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[
         Receives a function to close each opened resource, in order of opening.
     """
     icd, parameters = head.icd, head.device.parameters
-    separate: Link | None = None
+    separate: AnyLink | None = None
     where, bus = "", obc_bus(icd)
     if bus == "serial":
         from starhil.protocol.transports.serial import open_serial
@@ -49,7 +49,7 @@ async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[
     return client
 
 
-def _open_virtual_bus(head: Head) -> Link:
+def _open_virtual_bus(head: Head) -> AnyLink:
     """Return a link of the device to a private virtual CAN bus."""
     from starhil.protocol.transports.can import open_can
 

@@ -43,7 +43,7 @@ class Heard:
         self.last_s = self._loop.time()
 
 
-class BusLink(ABC, Generic[Item]):
+class Link(ABC, Generic[Item]):
     """Connects a device to a transport."""
 
     bus: ClassVar[str]
@@ -88,11 +88,11 @@ class BusLink(ABC, Generic[Item]):
         log.warning("%s", error)
 
 
-Link: TypeAlias = BusLink[Any]
+AnyLink: TypeAlias = Link[Any]
 """An open link of any kind."""
 
 
-class DeviceLink(BusLink[Item], Generic[Item, Style]):
+class RequestLink(Link[Item], Generic[Item, Style]):
     """Passes requests from a transport to the device, and replies back, in order."""
 
     def __init__(

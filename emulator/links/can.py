@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import ClassVar
 
 from starhil.emulator.device.requests import Requests
-from starhil.emulator.links.base import DeviceLink
+from starhil.emulator.links.base import RequestLink
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.protocol.can.cubespace import CanDeviceReceiver, CanId, encode_reply_frames
@@ -47,7 +47,7 @@ class CanDamage:
         return [item]
 
 
-class CanLink(DeviceLink[CanFrame, int]):
+class CanLink(RequestLink[CanFrame, int]):
     """Connects a device to a CAN transport, with the address in its parameter `can_address`.
 
     Two sent frames are at least `frame_gap_s` seconds apart.

@@ -16,7 +16,7 @@ from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.links.base import BusLink
+from starhil.emulator.links.base import Link
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanDamage
 from starhil.emulator.sensor.pipeline.messages import ImageResult
@@ -176,7 +176,7 @@ def _storage_refusal(error: EmulatorError | None) -> SdoAbortError | None:
     return None if error is None else SdoAbortError(AbortCode.HARDWARE, str(error))
 
 
-class CanopenLink(BusLink[CanFrame]):
+class CanopenLink(Link[CanFrame]):
     """Connects a device to a CAN bus as a CANopen slave.
 
     The node ID is the parameter `canopen_node` of the device, unless LSS has stored another one.

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
-from starhil.emulator.links.base import DeviceLink
+from starhil.emulator.links.base import RequestLink
 from starhil.protocol.messages import Receiver, Reply, Request
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.serial.stack import SerialStack
@@ -35,7 +35,7 @@ class SerialDamage:
         return [item[start : start + size] for start in range(0, len(item), size)]
 
 
-class SerialLink(DeviceLink[bytes, Dialect | None]):
+class SerialLink(RequestLink[bytes, Dialect | None]):
     """Connects a device to a serial transport, at the bit rate in its parameter `serial_baud`.
 
     The CubeSpace family has three dialects of replies, of which only c has unsolicited telemetry.

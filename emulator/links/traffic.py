@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
 
-from starhil.emulator.links.base import Link
+from starhil.emulator.links.base import AnyLink
 from starhil.emulator.simulation.signal import Signal
 from starhil.protocol.can.cubespace import REQUEST_KINDS, CanDeviceReceiver, CanHostReceiver, CanId
 from starhil.protocol.can.frame import CanFrame
@@ -58,7 +58,7 @@ class Traffic:
         self.passed: Signal[WireItem] = Signal("traffic")
         self._buses: set[str] = set()
 
-    def add(self, link: Link) -> None:
+    def add(self, link: AnyLink) -> None:
         """Report the items of a link."""
         link.wire.listener = partial(self._report, link.bus, True)  # noqa: FBT003 (outgoing)
         if link.bus not in self._buses:

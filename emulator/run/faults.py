@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.parameters import memory_bits
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.links.base import Link
+from starhil.emulator.links.base import AnyLink
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.sensor.pipeline.messages import DIRECTION_BITS, CatalogUpset
 from starhil.emulator.sensor.sky.objects import SkyObjects
@@ -91,7 +91,7 @@ BUSES: Final = tuple(name for name in FaultRequest.model_fields if name not in (
 class Faults:
     """The currently injected faults, also of links that are opened later."""
 
-    def __init__(self, device: Device, links: Sequence[Link]) -> None:
+    def __init__(self, device: Device, links: Sequence[AnyLink]) -> None:
         self._device = device
         self._links = links
 

@@ -25,7 +25,7 @@ from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import FileStore, MemoryStore, StateStore
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.links.base import Link
+from starhil.emulator.links.base import AnyLink
 from starhil.emulator.links.bus_address import in_use
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.name_lock import lock_symlink
@@ -76,8 +76,8 @@ class Head:
         self.clock: Clock = wiring.clock
         self.serial: SerialLink | None = None
         self.can: CanLink | None = None
-        self.canopen: Link | None = None
-        self.links: list[Link] = []
+        self.canopen: AnyLink | None = None
+        self.links: list[AnyLink] = []
         """The open links, in the order of opening."""
         self.traffic = Traffic()
         self.ready_fields: dict[str, str] = {}
@@ -159,7 +159,7 @@ class Head:
         links = self.profile.links
         return bool(links.canopen.node) or (self.icd.canopen_only and links.can.channel != "off")
 
-    def _add(self, link: Link) -> None:
+    def _add(self, link: AnyLink) -> None:
         self.links.append(link)
         self.traffic.add(link)
 
