@@ -14,8 +14,8 @@ if TYPE_CHECKING:
     from starid.catalog import StarCatalog as StarCatalog
     from starid.catalog import load_catalog as load_catalog
     from starid.identification.geometric.identifier import Identifier as Identifier
-    from starid.identification.interface import make_identifier as make_identifier
     from starid.identification.solution import Solution as Solution
+    from starid.identification.star_identifier import make_identifier as make_identifier
     from starid.imaging.detection import Detections as Detections
     from starid.imaging.detection import DetectionSettings as DetectionSettings
     from starid.imaging.detection import detect as detect
@@ -30,7 +30,7 @@ _HOMES: Final = {
     "StarCatalog": "starid.catalog",
     "detect": "starid.imaging.detection",
     "load_catalog": "starid.catalog",
-    "make_identifier": "starid.identification.interface",
+    "make_identifier": "starid.identification.star_identifier",
 }
 """Public name → module that holds it."""
 

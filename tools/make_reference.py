@@ -335,7 +335,7 @@ def identifier() -> str:
     import importlib
 
     from starhil.emulator.profile.sections import RunConfig
-    from starid.identification.interface import ALGORITHMS
+    from starid.identification.star_identifier import ALGORITHMS
 
     parts = []
     for algorithm in get_args(RunConfig.model_fields["algorithm"].annotation):

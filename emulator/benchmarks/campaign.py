@@ -29,8 +29,8 @@ from starid.arrays import Array
 from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
-from starid.identification.interface import StarIdentifier, make_identifier
 from starid.identification.solution import Solution
+from starid.identification.star_identifier import StarIdentifier, make_identifier
 from starid.imaging.detection import detect
 from starid.photograph.field_sweep import FieldSweep
 from starid.storage.results import Results, ResultStore

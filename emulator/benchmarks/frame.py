@@ -20,7 +20,7 @@ from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.catalog.earth import unix_time
-from starid.identification.interface import make_identifier
+from starid.identification.star_identifier import make_identifier
 from starid.imaging.detection import detect
 
 _WARM_UP: Final = 3

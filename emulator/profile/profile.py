@@ -248,7 +248,7 @@ def _checks(
         yield "sky", lambda table: Sky({**whole, **table})
     if "identifier" in values:
         from starhil.emulator.sensor.pipeline.star_identifiers import check_options
-        from starid.identification.interface import ALGORITHMS
+        from starid.identification.star_identifier import ALGORITHMS
 
         algorithm = run.get("algorithm", "geometric") if isinstance(run, dict) else "geometric"
         if algorithm in ALGORITHMS:

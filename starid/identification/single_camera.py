@@ -91,7 +91,7 @@ class CheckedDetections(NamedTuple):
     sigmas_known : bool
         Whether errors were given.
     observer_velocity : array (3,), optional
-        See `starid.identification.interface.StarIdentifier.identify`.
+        See `starid.identification.star_identifier.StarIdentifier.identify`.
     """
 
     xy: Array
@@ -119,7 +119,7 @@ class CheckedDetections(NamedTuple):
 
 
 class SingleCameraIdentifier(ABC):
-    """A star identifier for one camera and one catalogue (see `starid.identification.interface.StarIdentifier`).
+    """A star identifier for one camera and one catalogue (see `starid.identification.star_identifier.StarIdentifier`).
 
     Subclasses implement `_identify` and `_track`.
     """

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 from starid.arrays import Array
 from starid.attitude import Attitude, propagate, rate_between
 from starid.errors import StaridError
-from starid.identification.interface import StarIdentifier
 from starid.identification.solution import Solution
+from starid.identification.star_identifier import StarIdentifier
 
 LONGEST_GAP_S: Final = 10.0
 """Longest time without a valid attitude that a prediction bridges, seconds."""

@@ -66,7 +66,7 @@ class FieldSweep:
         settings : DetectionSettings, optional
             Settings of the detection.
         observer_velocity : array (3,), optional
-            See `starid.identification.interface.StarIdentifier.identify`.
+            See `starid.identification.star_identifier.StarIdentifier.identify`.
         time_limit_s, progress
             See `starid.photograph.solver.search_views`.
 

@@ -98,7 +98,7 @@ def solve_image(
     settings : DetectionSettings, optional
         Settings of the detection.
     observer_velocity : array (3,), optional
-        See `starid.identification.interface.StarIdentifier.identify`.
+        See `starid.identification.star_identifier.StarIdentifier.identify`.
     time_limit_s, progress
         With a `fov_tolerance`, see `search_views`.
 
@@ -151,7 +151,7 @@ def search_views(
     search_for : callable
         Returns the search for a camera; it is called again for each round and view.
     observer_velocity : array (3,), optional
-        See `starid.identification.interface.StarIdentifier.identify`.
+        See `starid.identification.star_identifier.StarIdentifier.identify`.
     time_limit_s : float
         Time after which the search is given up. Compiling kernels and building indices, which is done once, does
         not count.
@@ -224,7 +224,7 @@ def refine_solution(
     begin : float
         Value of the performance counter at the start.
     observer_velocity : array (3,), optional
-        See `starid.identification.interface.StarIdentifier.identify`.
+        See `starid.identification.star_identifier.StarIdentifier.identify`.
     """
     identifier = search.identifier
     found = view.detections

@@ -50,8 +50,8 @@ from starid.camera.calibration import attitude_covariance
 from starid.catalog import load_catalog
 from starid.catalog.aberration import aberrated
 from starid.errors import StaridError
-from starid.identification.interface import StarIdentifier
 from starid.identification.solution import Reason, Solution
+from starid.identification.star_identifier import StarIdentifier
 from starid.imaging.detection import Detections, DetectionSettings, detect
 
 STARS_SENT: Final = 16

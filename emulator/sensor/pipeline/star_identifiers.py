@@ -22,7 +22,7 @@ from starhil.protocol.errors import remedy
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.identification.interface import ALGORITHMS, StarIdentifier, make_identifier
+from starid.identification.star_identifier import ALGORITHMS, StarIdentifier, make_identifier
 
 if TYPE_CHECKING:
     from starid.identification.geometric.identifier import Identifier

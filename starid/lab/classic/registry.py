@@ -7,8 +7,8 @@ from typing import Any, Final, cast
 
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
-from starid.identification import interface
-from starid.identification.interface import StarIdentifier
+from starid.identification import star_identifier
+from starid.identification.star_identifier import StarIdentifier
 
 CLASSICS: Final = (
     "pyramid",
@@ -38,7 +38,7 @@ def make_identifier(
 ) -> StarIdentifier:
     """Make a star identifier as `starid.make_identifier` does, or one of `CLASSICS`."""
     if algorithm not in CLASSICS:
-        return interface.make_identifier(algorithm, camera, catalog, **options)
+        return star_identifier.make_identifier(algorithm, camera, catalog, **options)
     return cast("StarIdentifier", class_of(algorithm)(camera, catalog, **options))
 
 

@@ -31,7 +31,7 @@ _COLUMNS: Final = (
 
 @lru_cache(maxsize=2)
 def _identifier(name: str) -> Any:
-    from starid.identification.interface import make_identifier
+    from starid.identification.star_identifier import make_identifier
 
     identifier: Any = make_identifier(name)
     identifier.warm_up()

@@ -13,8 +13,8 @@ from starid.attitude import Attitude, propagate, random_attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
 from starid.errors import StaridError
-from starid.identification.interface import StarIdentifier, make_identifier
 from starid.identification.solution import Reason
+from starid.identification.star_identifier import StarIdentifier, make_identifier
 from starid.identification.thesis.database import DatabaseError, DatabaseParameters, build_database
 from starid.identification.thesis.database_choice import obtain_database
 from starid.identification.thesis.database_file import save_database

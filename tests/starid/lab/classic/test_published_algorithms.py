@@ -14,8 +14,8 @@ from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.errors import StaridError
 from starid.identification.geometric.pattern_index import field_solid_angle, resolved_stars
-from starid.identification.interface import StarIdentifier
 from starid.identification.solution import Reason
+from starid.identification.star_identifier import StarIdentifier
 from starid.lab.classic.registry import CLASSICS, make_identifier
 from starid.lab.classic.solver import EVEN_PER_FIELD, ClassicIdentifier
 from starid.lab.leaderboard.scenes import SceneMaker, SceneSettings
