@@ -13,7 +13,7 @@ from starhil.hil_tests.rig.rig import Rig
 from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.results import SessionResult, StepResult
 from starhil.hil_tests.session.script import Script
-from starhil.hil_tests.session.steps import Attempt, Session, Step
+from starhil.hil_tests.session.steps import Attempt, SessionState, Step
 from starhil.protocol.errors import ProtocolError
 
 
@@ -33,7 +33,7 @@ def run_steps(
     if truth_path is None and script.truth.file is not None:
         truth_path = folder / script.truth.file
     truth = script.truth.attitude if truth_path is None else TruthLogReader(truth_path)
-    session = Session(rig, folder, truth)
+    session = SessionState(rig, folder, truth)
     begin = time.monotonic()
     planned = script.planned(rig.links)
     results: list[StepResult] = []
@@ -59,7 +59,7 @@ def run_steps(
     return SessionResult(script.title, tuple(results), time.monotonic() - begin, interruption)
 
 
-def _run_step(session: Session, number: int, step: Step, link: str) -> StepResult:
+def _run_step(session: SessionState, number: int, step: Step, link: str) -> StepResult:
     begin = session.step_begin_s = time.monotonic()
     links = session.rig.links
     if link and link not in links:
@@ -81,7 +81,7 @@ def _run_step(session: Session, number: int, step: Step, link: str) -> StepResul
     return StepResult(number, step.name, link, status, detail, time.monotonic() - begin, *found)
 
 
-def _try_until_passed(session: Session, step: Step, link: str) -> Attempt:
+def _try_until_passed(session: SessionState, step: Step, link: str) -> Attempt:
     """Try an action once, or repeatedly until its expectations hold or its time is over."""
     deadline = None if step.within_s is None else time.monotonic() + step.within_s
     while True:
@@ -94,7 +94,7 @@ def _try_until_passed(session: Session, step: Step, link: str) -> Attempt:
         time.sleep(min(step.pause_s, max(0.0, deadline - time.monotonic())))
 
 
-def _try_once(session: Session, step: Step, link: str) -> Attempt:
+def _try_once(session: SessionState, step: Step, link: str) -> Attempt:
     try:
         attempt = step.run(session, link)
     except (BenchError, ProtocolError) as error:

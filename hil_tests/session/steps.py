@@ -156,7 +156,7 @@ Link = Literal["serial", "can", "both"]
 
 
 @dataclass
-class Session:
+class SessionState:
     """What the steps of a session share."""
 
     rig: Rig
@@ -224,7 +224,7 @@ class Step(Keys):
     max_latency_s: Duration | None = None
 
     @abstractmethod
-    def run(self, session: Session, link: str) -> Attempt:
+    def run(self, session: SessionState, link: str) -> Attempt:
         """Try the action once on a link; `link` is empty for a step that needs none."""
 
     @property
@@ -271,7 +271,7 @@ class Step(Keys):
                     f"expect: {text}" for text in _impossible(row.named_fields[name], self.expect[name])
                 )
 
-    def judged(self, session: Session, reading: Reading) -> Attempt:
+    def judged(self, session: SessionState, reading: Reading) -> Attempt:
         """Compare a reading with the expectations."""
         attempt = Attempt(
             detail=summarize(reading.values), values=reading.values, latency_s=reading.latency_s or None
@@ -343,7 +343,7 @@ class Command(RequestStep):
                 except ProtocolError as error:
                     yield f"with: {self.row.name}.{name}: {error}"
 
-    def run(self, session: Session, link: str) -> Attempt:
+    def run(self, session: SessionState, link: str) -> Attempt:
         """Send the telecommand."""
         data = self.raw
         if data is None:
@@ -370,7 +370,7 @@ class Read(ReadingStep, RequestStep):
     default_name = "read {self.row.name}"
     row: Readable = Field(alias="read")
 
-    def run(self, session: Session, link: str) -> Attempt:
+    def run(self, session: SessionState, link: str) -> Attempt:
         """Read the row."""
         attempt, reading = self.exchange(session.rig.client(link).read, self.row.name)
         return attempt if reading is None or attempt.problem else self.judged(session, reading)
@@ -388,7 +388,7 @@ class Listen(ReadingStep):
         """No pause: the messages set the pace, and each is judged."""
         return 0.0
 
-    def run(self, session: Session, link: str) -> Attempt:
+    def run(self, session: SessionState, link: str) -> Attempt:
         """Judge the next messages since the begin of the step that no earlier attempt has judged."""
         client = session.rig.client(link)
         attempt = Attempt()
@@ -427,7 +427,7 @@ class Sample(ReadingStep):
             return table
         return {**table, **{"sample" if key == "telemetry" else key: value for key, value in inner.items()}}
 
-    def run(self, session: Session, link: str) -> Attempt:
+    def run(self, session: SessionState, link: str) -> Attempt:
         """Read the row for some time; write the values, and judge each reading."""
         client = session.rig.client(link)
         name = self.file or f"{self.row.name}.csv"
@@ -490,7 +490,7 @@ class SetParameter(RequestStep):
             except ProtocolError as error:
                 yield str(error)
 
-    def run(self, session: Session, link: str) -> Attempt:
+    def run(self, session: SessionState, link: str) -> Attempt:
         """Set the parameter; if it must be accepted, read it back."""
         client, name = session.rig.client(link), self.parameter.name
         value = resolve(self.value, session.variables)
@@ -522,7 +522,7 @@ class GetParameter(Step):
         self._row = (info.context or {})["icd"].telemetry["parameter"]
         yield from super()._problems(info)
 
-    def run(self, session: Session, link: str) -> Attempt:
+    def run(self, session: SessionState, link: str) -> Attempt:
         """Read the parameter."""
         return self.judged(session, session.rig.client(link).read_parameter(self.parameter.name))
 
@@ -536,7 +536,7 @@ class DownloadImage(Step):
     method: Literal["frames", "burst"] = "frames"
     """`frames` of 128 bytes, or `burst` packets with hole maps."""
 
-    def run(self, session: Session, link: str) -> Attempt:
+    def run(self, session: SessionState, link: str) -> Attempt:
         """Download the image; a blank one is a problem."""
         image = session.rig.client(link).download_image(self.size, method=self.method)
         write_png(session.folder / self.file, image.pixels, image.width, image.height)
@@ -567,7 +567,7 @@ class Send(Step):
         self.link = "can" if isinstance(self.data[0], CanFrame) else "serial"
         return self
 
-    def run(self, session: Session, link: str) -> Attempt:
+    def run(self, session: SessionState, link: str) -> Attempt:
         """Send the data and compare what comes back."""
         wanted = self.answer or []
         client = session.rig.client(link)
@@ -590,7 +590,7 @@ class Wait(Step):
     needs_link = False
     seconds: Duration = Field(alias="wait_s")
 
-    def run(self, session: Session, link: str) -> Attempt:  # noqa: ARG002 -- any session, no link
+    def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- any session, no link
         """Wait."""
         time.sleep(self.seconds)
         return Attempt()
@@ -604,7 +604,7 @@ class Restart(Step):
     needs_emulator = True
     signal: Literal["term", "kill"] = Field(alias="restart")
 
-    def run(self, session: Session, link: str) -> Attempt:  # noqa: ARG002 -- no link
+    def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- no link
         """Restart the emulator."""
         session.rig.restart(self.signal)
         return Attempt(detail="ready again")
@@ -619,7 +619,7 @@ class Control(Step):
     action: Literal["fault", "clear_faults", "set_truth", "scenario", "step"] = Field(alias="control")
     keys: Annotated[dict[str, Any], AfterValidator(_as_json)] = Field({}, alias="with")
 
-    def run(self, session: Session, link: str) -> Attempt:  # noqa: ARG002 -- no link
+    def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- no link
         """Send the request."""
         return Attempt(detail=json.dumps(session.rig.control(self.action, self.keys)))
 

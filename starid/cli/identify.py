@@ -295,7 +295,7 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
         return report
     from starid.catalog import load_catalog
     from starid.catalog.star_names import STAR_NAMES
-    from starid.identification.missing import missing_stars
+    from starid.identification.undetected import missing_stars
 
     attitude = solution.attitude
     missing = missing_stars(solution, result.camera, result.stars, found.xy_px)

@@ -12,9 +12,9 @@ from starid.attitude import Attitude, propagate, random_attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.errors import StaridError
 from starid.identification.geometric.identifier import Effort, Identifier
-from starid.identification.missing import missing_stars
 from starid.identification.solution import Reason, Solution
 from starid.identification.tracker import Tracker
+from starid.identification.undetected import missing_stars
 from starid.lab.leaderboard.scenes import SceneSettings
 from tests.starid.identification.geometric.sky_points import identifier, maker, sky
 
