@@ -18,8 +18,9 @@ from starhil.emulator.cli.endurance import read_life
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.launch.recording import read_run
-from starhil.emulator.launch.replay import EVENTS_FILE, RUN_FILE, read_events
+from starhil.emulator.launch.replay import read_events
 from starhil.emulator.profile import Profile, load_profile
+from starhil.emulator.run.recorder import EVENTS_FILE, RUN_FILE
 from starhil.emulator.truth.ccsds_file import write_aem
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth.table import FileTruth, Span
