@@ -34,9 +34,11 @@ import pytest
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "out" / "mutation"
 REASONS = ROOT / "tests" / "tools" / "mutation_survivors.toml"
-CODECS = (
-    "checks codec framings serial_stack envelope can_framing flow socketcand candump image_transfer values"
-)
+_WIRE = [
+    "tests/protocol",
+    *(f"--ignore=tests/protocol/{folder}" for folder in ("canopen", "transports")),
+    "--ignore=tests/protocol/export",  # its processes need more than MEMORY
+]
 GROUPS = {
     "emulator/device": [
         "tests/emulator/device",
@@ -45,14 +47,9 @@ GROUPS = {
     ],
     "emulator/links": ["tests/emulator/links"],
     "protocol/canopen": ["tests/protocol/canopen", "tests/emulator/links/test_canopen.py"],
-    "protocol": [
-        "tests/protocol",
-        "--ignore=tests/protocol/canopen",
-        "--ignore=tests/protocol/transports",
-        "--ignore-glob=tests/protocol/test_export*",  # their processes need more than MEMORY
-    ],
+    **dict.fromkeys(("protocol/serial", "protocol/can", "protocol/icd"), _WIRE),
 }
-"""Folders of modules, and the tests among which those of a line are found; of `protocol`, only CODECS."""
+"""Folders of modules, and the tests among which those of a line are found."""
 PYTEST = [
     "-q",
     "--assert=plain",  # pytest would load what it rewrites past the mutant
@@ -322,11 +319,7 @@ def try_group(group: str, tests: list[str], options: argparse.Namespace) -> None
             print(f"{item['module']}:{item['line']}: {item['result']}: {item['change']}", flush=True)
 
     pytest.main(["--collect-only", "-qq", *PYTEST[1:], *tests])  # imports everything once
-    paths = [
-        path
-        for path in sorted((ROOT / group).glob("*.py"))
-        if group != "protocol" or path.stem in CODECS.split()
-    ]
+    paths = sorted((ROOT / group).glob("*.py"))
     every = [
         (path, number)
         for path in paths

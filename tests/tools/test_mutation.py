@@ -26,7 +26,7 @@ def test_each_survivor_with_a_reason_is_a_mutant_of_its_line(module):
 
 
 def test_every_change_can_be_made():
-    path = ROOT / "protocol" / "checks.py"
+    path = ROOT / "protocol" / "serial" / "checks.py"
     source = ast.unparse(ast.parse(path.read_text("utf-8")))
     count = sum(1 for _ in mutation.changes(ast.parse(path.read_text("utf-8"))))
     changed = [ast.unparse(mutation.mutant(path, number)[0]) for number in range(count)]
