@@ -138,7 +138,7 @@ def test_a_folder_of_another_version_is_rejected_and_what_differs_is_named(what,
 def test_the_sources_that_decide_a_result_are_part_of_the_plan(tmp_path, monkeypatch):
     before = made_by()["sources"]
     package = tmp_path / "emulator"
-    for room in ("sky", "sensor", "pipeline", "benchmarks"):
+    for room in ("sensor", "benchmarks"):
         shutil.copytree(Path(campaign.__file__).parent.parent / room, package / room)
     monkeypatch.setattr(campaign, "__file__", str(package / "benchmarks" / "campaign.py"))
     assert made_by()["sources"] == before
