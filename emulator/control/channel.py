@@ -35,13 +35,13 @@ from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.run.head import Head
 from starhil.emulator.run.truth_log import compare
 from starhil.emulator.sensor.pipeline.messages import as_quaternion
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.simulation.guard import until_cancelled
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.json_lines import JsonError, parse_object, read_lines
 from starhil.emulator.truth.live import LiveTruth
 from starhil.protocol.errors import ProtocolError, did_you_mean, remedy
 from starhil.protocol.files.validation import problems
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.connections import REQUEST_S, ConnectionLimit
 from starid.errors import StaridError
 

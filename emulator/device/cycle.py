@@ -21,7 +21,7 @@ import numpy as np
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Modes
 from starhil.emulator.device.navigation import observer_velocity
-from starhil.emulator.device.parameters import Parameters, exposure_period_s, solver_settings
+from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming
 from starhil.emulator.device.rate import RateEstimator
 from starhil.emulator.device.signals import Signals
@@ -35,11 +35,13 @@ from starhil.emulator.sensor.pipeline.messages import (
     FrameRequest,
     FrameResult,
     IndexRequest,
+    SolverSettings,
     Triple,
 )
-from starhil.emulator.simulation.clock import NANOSECONDS, DeviceTime
+from starhil.emulator.simulation.clock import DeviceTime
 from starhil.emulator.simulation.scheduler import Event, Scheduler
 from starhil.emulator.truth.source import TruthState
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.arrays import Array
 from starid.attitude import Attitude, propagate
 
@@ -244,7 +246,7 @@ class FrameCycle:
 
     def index_request(self) -> IndexRequest:
         """Return the request for the star index of the current parameters."""
-        return IndexRequest(solver_settings(self._parameters), self.upsets)
+        return IndexRequest(SolverSettings.of(self._parameters), self.upsets)
 
     def single_frame(self, mid_ns: int) -> FrameRequest:
         """Return the request for an exposure that is not solved, with a given simulation time of mid-exposure."""
@@ -271,7 +273,7 @@ class FrameCycle:
             gain=float(parameters["analog_gain"]),
             solve=solve,
             predicted=predicted,
-            settings=solver_settings(parameters),
+            settings=SolverSettings.of(parameters),
             faults=self._surroundings.faults,
             temperature_c=conditions.temperature_c,
             particles_s=conditions.particles_s,

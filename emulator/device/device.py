@@ -27,7 +27,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
 from starhil.emulator.sensor.pipeline.client import PipelineClient
 from starhil.emulator.sensor.pipeline.messages import IDENTITY, Quaternion
-from starhil.emulator.simulation.clock import NANOSECONDS, Clock, DeviceTime
+from starhil.emulator.simulation.clock import Clock, DeviceTime
 from starhil.emulator.simulation.guard import log_internal_error, one_line
 from starhil.emulator.simulation.output_file import Output
 from starhil.emulator.simulation.scheduler import Event, Scheduler
@@ -35,6 +35,7 @@ from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Field
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.icd.units_of_measure import factor
 from starhil.protocol.icd.values import Value
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.sensor.pipeline.messages import Triple
-from starhil.emulator.simulation.clock import NANOSECONDS
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.attitude import Attitude
 
 HISTORY: Final = 10

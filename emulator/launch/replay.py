@@ -41,11 +41,12 @@ from starhil.emulator.sensor.pipeline.client import (
     ReplyCallback,
 )
 from starhil.emulator.sensor.pipeline.messages import PipelineEnded, PipelineReady
-from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock
+from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.simulation.guard import call_guarded
 from starhil.emulator.truth.config import Strict, TruthConfig
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 from starid.errors import StaridError

@@ -26,10 +26,11 @@ from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.client import WorkerClient
 from starhil.emulator.sensor.pipeline.error_model import ErrorModel
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
-from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock
+from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.truth.config import TruthConfig
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 

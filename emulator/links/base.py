@@ -13,9 +13,9 @@ from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.wire_faults import Damage, WireFaults
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.simulation.scheduler import Event
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.messages import ErrorCode, LinkFault, Receiver, Reply, Request
 from starhil.protocol.transports.base import Transport
 

@@ -11,9 +11,10 @@ from typing import Any, Final
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.run.recorder import Recorder
 from starhil.emulator.sensor.pipeline.client import PipelineClient
-from starhil.emulator.simulation.clock import NANOSECONDS, Clock, LatchedClock, SteppedClock
+from starhil.emulator.simulation.clock import Clock, LatchedClock, SteppedClock
 from starhil.emulator.simulation.guard import call_guarded
 from starhil.emulator.simulation.scheduler import Event, Scheduler
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
 
 log = logging.getLogger("starhil.run")

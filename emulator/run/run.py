@@ -30,10 +30,11 @@ from starhil.emulator.run.pump import StepPump
 from starhil.emulator.run.recorder import Recorder
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
-from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock, make_clock
+from starhil.emulator.simulation.clock import SteppedClock, make_clock
 from starhil.emulator.simulation.guard import close_all
 from starhil.emulator.truth.truth import Truth, TruthHost
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.unit import load_unit
 from starhil.protocol.unit.examples import served
 

@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.simulation.clock import NANOSECONDS, Clock, make_clock
+from starhil.emulator.simulation.clock import Clock, make_clock
 from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
 from starhil.emulator.truth.feed import LiveFeed, Step
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starhil.emulator.truth.table import FileTruth
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.attitude import Attitude
 
 
