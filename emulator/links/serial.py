@@ -53,6 +53,7 @@ class SerialLink(RequestLink[bytes, Dialect | None]):
     ) -> None:
         self._console = console
         self._stack = SerialStack(requests.device.icd)
+        self._timeout_s = self._stack.link.timeout
         super().__init__(requests, transport, SerialDamage(), seed)
         self._port = transport
         self._baud = self._wanted_baud()
