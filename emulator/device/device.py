@@ -45,12 +45,11 @@ Background: TypeAlias = Callable[[Callable[[], None], Callable[[EmulatorError | 
 """Runs slow work (the first argument), then calls the second argument with the error or None."""
 
 PREDICTION_LIMIT_S: Final = 30.0
-"""Maximum age of an attitude from which tracking can start, seconds."""
+"""Maximum age of an attitude from which tracking can start, seconds (docs/rules.md, R14)."""
 
 STALE_PERIODS: Final = 3
-"""Number of update periods without a new measurement after which the last attitude is no longer valid."""
-
-PROCESSING_ALLOWANCE_S: Final = 2.0
+STALE_S: Final = 2.0
+"""An attitude is valid for at most `STALE_PERIODS` update periods and `STALE_S` after its result (docs/rules.md, R15)."""
 
 NOTHING_ACCEPTED: Final[Mapping[str, Mapping[str, Value]]] = MappingProxyType({})
 
@@ -314,7 +313,7 @@ class Device:
         last = self.latest
         if last is None or not self.modes.mode.makes_frames:
             return None
-        limit_s = STALE_PERIODS * last.period_s + PROCESSING_ALLOWANCE_S
+        limit_s = STALE_PERIODS * last.period_s + STALE_S
         age_ns = now_ns - last.published_ns
         return last if age_ns <= limit_s * NANOSECONDS else None
 
