@@ -92,9 +92,9 @@ class Device:
         self.clock = clock
         self.store = store
         self.signals = signals = Signals()
-        signals.frame_published.connect(self._frame_published)
-        signals.mode_changed.connect(self._mode_changed)
-        signals.parameters_changed.connect(self._parameters_changed)
+        signals.frame_published.connect(self._frame_published, first=True)
+        signals.mode_changed.connect(self._mode_changed, first=True)
+        signals.parameters_changed.connect(self._parameters_changed, first=True)
         self.scheduler = Scheduler()
         self.time = DeviceTime(clock)
         try:
