@@ -33,6 +33,7 @@ from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.run import Run
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.run.head import Head
+from starhil.emulator.run.tape import ClearedFaults, NewFaults
 from starhil.emulator.run.truth_log import compare
 from starhil.emulator.sensor.pipeline.messages import as_quaternion
 from starhil.emulator.simulation.guard import until_cancelled
@@ -264,12 +265,12 @@ class ControlServer:
     async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
         wanted = await _parse(FaultRequest, request)
         head.faults.check(wanted)
-        self._run.record("fault", request=request)
+        self._run.record(NewFaults, request=wanted)
         head.faults.inject(wanted)
         return {"faults": head.faults.describe()}
 
     async def _clear_faults(self, head: Head, _request: dict[str, Any]) -> Answer:
-        self._run.record("clear_faults")
+        self._run.record(ClearedFaults)
         head.faults.clear()
         return {"faults": head.faults.describe()}
 
