@@ -12,7 +12,7 @@ Arriving_contra = TypeVar("Arriving_contra", contravariant=True)
 Message_co = TypeVar("Message_co", covariant=True)
 
 FIRST_TELEMETRY_ID: Final = 128
-"""IDs from this one on are telemetry, lower IDs are telecommands."""
+"""On CubeSpace's links, IDs from this one on are telemetry, lower IDs are telecommands."""
 
 DEFAULT_MAX_SIZE: Final = 512
 """Longest message that a receiver accepts: the buffer size of the published host library."""

@@ -23,13 +23,13 @@ from typing import Any, Final
 import numpy as np
 from Basilisk.architecture import messaging, sysModel
 
+from starhil.protocol.icd.conventions import NANOSECONDS
+
 ANSWER_WITHIN_S: Final = 300.0
 """Maximum time for an answer in lock-step, seconds; at its first start, the emulator compiles kernels."""
 
 EARTH_RADIUS_M: Final = 6.3e6
 """Positions closer to the origin are not in an Earth orbit and are not sent."""
-
-NANOSECONDS: Final = 1e9
 
 
 class StarTrackerFeedError(Exception):

@@ -1,4 +1,4 @@
-"""Write what is generated from the code: the tables in docs/, and the quantities in configs/units/model.toml.
+"""Write the tables in docs/ that are generated from the code and the device model.
 
 Run `python tools/make_reference.py`.
 
@@ -8,7 +8,7 @@ A page contains its own text and, between two comments with the name of a table,
     …
     <!-- end: profile -->
 
-In a TOML file the comments are `# begin: …` and `# end: …`. tests/test_reference.py compares every table with the code.
+tests/test_reference.py compares every table with the code.
 """
 
 from __future__ import annotations
@@ -30,7 +30,6 @@ from pydantic_core import PydanticUndefined
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 DOCS: Final = ROOT / "docs"
-MODEL_FILE: Final = ROOT / "configs" / "units" / "model.toml"
 
 UNITS: Final = {
     "baud": "Bd",
@@ -456,13 +455,12 @@ def unit_definition() -> str:
 
 def quantities() -> str:
     """Every quantity of the device."""
-    from starhil.emulator.device.quantities import QUANTITIES
     from starhil.protocol.icd.device_model import device_model
 
-    enums = device_model().enums
+    model = device_model()
     rows: list[Row] = []
-    for item in (quantity.declared for quantity in QUANTITIES.values()):
-        kind = item.type if item.enum is None else f"name: {', '.join(enums[item.enum].values)}"
+    for item in model.quantities.values():
+        kind = item.type if item.enum is None else f"name: {', '.join(model.enums[item.enum].values)}"
         count = f" n from 1 to {item.count}." if item.count else ""
         rows.append((f"`{item.name}`", kind, item.unit, item.doc + count))
     return table(rows, ("quantity", "type", "unit", "meaning"))
@@ -509,16 +507,6 @@ def record_rows(kind: type) -> list[Row]:
         if function is not None:
             types[name], texts[name] = function.__annotations__["return"], plain_text(item.__doc__)
     return [(f"`{name}`", f"`{types[name]}`", texts[name]) for name in types]
-
-
-def model_quantities() -> str:
-    """Every quantity of the device, as TOML."""
-    from starhil.emulator.device.quantities import QUANTITIES
-
-    return "\n\n".join(
-        "\n".join(["[[quantity]]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items())])
-        for keys in (item.declared.model_dump(exclude_defaults=True) for item in QUANTITIES.values())
-    )
 
 
 def actions() -> str:
@@ -614,13 +602,13 @@ def shown_default(value: Any) -> str:
 TABLES: Final[dict[str, Callable[[], str]]] = {
     function.__name__: function
     for function in (
-        *(actions, commands, device_parameters, faults, identifier, model_quantities, orbit, profile),
+        *(actions, commands, device_parameters, faults, identifier, orbit, profile),
         *(quantities, scenario, sensor, sky, snapshot, truth, unit_definition),
     )
 }
 """Name of a table in a page → function that writes it."""
 
-_BLOCK: Final = re.compile(r"((?:<!--|#) begin: (\w+).*?\n).*?((?:<!--|#) end: \2)", re.DOTALL)
+_BLOCK: Final = re.compile(r"(<!-- begin: (\w+).*?\n).*?(<!-- end: \2)", re.DOTALL)
 
 
 def with_tables(page: str) -> str:
@@ -630,8 +618,7 @@ def with_tables(page: str) -> str:
 
 def pages() -> list[Path]:
     """Return the files that contain generated tables."""
-    files = [MODEL_FILE, *sorted(DOCS.glob("*.md"))]
-    return [path for path in files if _BLOCK.search(path.read_text(encoding="utf-8"))]
+    return [path for path in sorted(DOCS.glob("*.md")) if _BLOCK.search(path.read_text(encoding="utf-8"))]
 
 
 def main() -> None:

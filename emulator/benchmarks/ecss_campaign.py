@@ -20,13 +20,18 @@ from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, open_stor
 from starhil.emulator.benchmarks.hard_sky import direction_around
 from starhil.emulator.device.device import adopt_camera, profile_defaults
 from starhil.emulator.device.navigation import observer_velocity
-from starhil.emulator.device.parameters import Parameters, exposure_period_s, solver_settings
+from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming, PowerModel
 from starhil.emulator.device.surroundings import orbit_of
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
 from starhil.emulator.profile.pipeline_setup import pipeline_setup
-from starhil.emulator.sensor.pipeline.messages import FrameRequest, FrameResult, camera_constants
+from starhil.emulator.sensor.pipeline.messages import (
+    FrameRequest,
+    FrameResult,
+    SolverSettings,
+    camera_constants,
+)
 from starhil.emulator.sensor.pipeline.pipeline import Pipeline
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.unit import load_unit
@@ -144,7 +149,7 @@ class EcssDevice:
         self.start_unix_s, self.orbit = profile.start_unix_s, orbit_of(profile)
         parameters = self.parameters = Parameters(icd, profile_defaults(profile, icd))
         adopt_camera(parameters, profile, camera_constants(self.pipeline.camera.to_dict()))
-        self.settings = solver_settings(parameters)
+        self.settings = SolverSettings.of(parameters)
         self.exposure_s = float(parameters["exposure"]) / 1000.0
         self.gain = float(parameters["analog_gain"])
         self.max_rate_deg_s = float(parameters["max_rate"])

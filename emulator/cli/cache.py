@@ -59,11 +59,11 @@ def warm(
     from dataclasses import replace
 
     from starhil.emulator.device.device import adopt_camera, profile_defaults
-    from starhil.emulator.device.parameters import Parameters, solver_settings
+    from starhil.emulator.device.parameters import Parameters
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
     from starhil.emulator.profile.pipeline_setup import pipeline_setup
     from starhil.emulator.sensor.pipeline.client import WorkerClient
-    from starhil.emulator.sensor.pipeline.messages import IndexRequest, camera_constants
+    from starhil.emulator.sensor.pipeline.messages import IndexRequest, SolverSettings, camera_constants
     from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
     from starhil.protocol.unit import load_unit
     from starid.storage.cache import cache_dir, kernels_written_since
@@ -80,7 +80,7 @@ def warm(
         progress = asyncio.create_task(report_slow_start())
         try:
             adopt_camera(parameters, loaded, camera_constants((await imager.start()).camera))
-            imager.prepare(IndexRequest(solver_settings(parameters)))
+            imager.prepare(IndexRequest(SolverSettings.of(parameters)))
             await imager.settle()
         finally:
             progress.cancel()

@@ -24,9 +24,9 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.emulator.run import Run
 from starhil.emulator.run.head import Head
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.simulation.guard import log_internal_error, one_line
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.console")

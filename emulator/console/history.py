@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode
-from starhil.emulator.simulation.clock import NANOSECONDS
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.attitude import ARCSEC_PER_RAD, Attitude
 
 COLUMNS: Final = (

@@ -27,10 +27,10 @@ from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
 from starhil.emulator.links.traffic import Decoder, WireItem
 from starhil.emulator.run.head import Head
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.simulation.guard import log_internal_error
 from starhil.emulator.simulation.output_file import OutputFile
 from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.conventions import NANOSECONDS
 
 log = logging.getLogger("starhil.record")
 

@@ -33,15 +33,16 @@ from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.run import Run
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.run.head import Head
+from starhil.emulator.run.tape import ClearedFaults, NewFaults
 from starhil.emulator.run.truth_log import compare
 from starhil.emulator.sensor.pipeline.messages import as_quaternion
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.simulation.guard import until_cancelled
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.json_lines import JsonError, parse_object, read_lines
 from starhil.emulator.truth.live import LiveTruth
 from starhil.protocol.errors import ProtocolError, did_you_mean, remedy
 from starhil.protocol.files.validation import problems
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.connections import REQUEST_S, ConnectionLimit
 from starid.errors import StaridError
 
@@ -264,12 +265,12 @@ class ControlServer:
     async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
         wanted = await _parse(FaultRequest, request)
         head.faults.check(wanted)
-        self._run.record("fault", request=request)
+        self._run.record(NewFaults, request=wanted)
         head.faults.inject(wanted)
         return {"faults": head.faults.describe()}
 
     async def _clear_faults(self, head: Head, _request: dict[str, Any]) -> Answer:
-        self._run.record("clear_faults")
+        self._run.record(ClearedFaults)
         head.faults.clear()
         return {"faults": head.faults.describe()}
 

@@ -28,12 +28,12 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile.toml_file import find_toml, read_toml
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.run.head import Head
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.simulation.scheduler import Action
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.truth import Truth
 from starhil.protocol.errors import did_you_mean
 from starhil.protocol.files.validation import problems
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")

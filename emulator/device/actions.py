@@ -19,7 +19,7 @@ from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.subscriptions import Subscription
-from starhil.emulator.simulation.clock import NANOSECONDS
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.icd.values import MessageError, Value
 from starhil.protocol.messages import ErrorCode, Reply
 

@@ -21,9 +21,8 @@ import numpy as np
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Modes
 from starhil.emulator.device.navigation import observer_velocity
-from starhil.emulator.device.parameters import Parameters, exposure_period_s, solver_settings
+from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming
-from starhil.emulator.device.rate import RateEstimator
 from starhil.emulator.device.signals import Signals
 from starhil.emulator.device.surroundings import Surroundings
 from starhil.emulator.profile import Profile
@@ -35,13 +34,16 @@ from starhil.emulator.sensor.pipeline.messages import (
     FrameRequest,
     FrameResult,
     IndexRequest,
+    SolverSettings,
     Triple,
 )
-from starhil.emulator.simulation.clock import NANOSECONDS, DeviceTime
+from starhil.emulator.simulation.clock import DeviceTime
 from starhil.emulator.simulation.scheduler import Event, Scheduler
 from starhil.emulator.truth.source import TruthState
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.arrays import Array
-from starid.attitude import Attitude, propagate
+from starid.attitude import Attitude
+from starid.identification.attitude_history import AttitudeHistory
 
 log = logging.getLogger("starhil.device")
 
@@ -49,6 +51,9 @@ Argument = TypeVar("Argument")
 
 MAX_PENDING: Final = 2
 """Number of pending requests at which exposures are skipped; more if more fit into the modelled time."""
+
+LONGEST_GAP_PERIODS: Final = 2.5
+"""Longest gap between two attitudes from which a rate is estimated, update periods."""
 
 
 @dataclass
@@ -87,7 +92,6 @@ class FrameCycle:
         signals: Signals,
     ) -> None:
         self._timing = profile.timing
-        self._rate_window = profile.device.rate_window
         self._scheduler = scheduler
         self._imager = imager
         self._time = time
@@ -96,7 +100,7 @@ class FrameCycle:
         self._modes = modes
         self._surroundings = surroundings
         self._signals = signals
-        self._rates = RateEstimator()
+        self._history = AttitudeHistory(profile.device.rate_window, NANOSECONDS)
         self._next: Event | None = None
         self._generation = 0
         self._in_flight: deque[_Frame] = deque()
@@ -155,7 +159,7 @@ class FrameCycle:
     def reset(self) -> None:
         """Stop and discard all attitudes, because the device restarts."""
         self.stop()
-        self._rates.clear()
+        self._history.clear()
         self.published = self.skipped = 0
         self.upsets = ()
 
@@ -176,7 +180,7 @@ class FrameCycle:
 
     def has_fix(self, within_s: float) -> bool:
         """Return whether there is an attitude not older than `within_s`."""
-        last = self._rates.last
+        last = self._history.last
         return last is not None and self._now_ns() - last[0] <= within_s * NANOSECONDS
 
     @property
@@ -244,7 +248,7 @@ class FrameCycle:
 
     def index_request(self) -> IndexRequest:
         """Return the request for the star index of the current parameters."""
-        return IndexRequest(solver_settings(self._parameters), self.upsets)
+        return IndexRequest(SolverSettings.of(self._parameters), self.upsets)
 
     def single_frame(self, mid_ns: int) -> FrameRequest:
         """Return the request for an exposure that is not solved, with a given simulation time of mid-exposure."""
@@ -271,7 +275,7 @@ class FrameCycle:
             gain=float(parameters["analog_gain"]),
             solve=solve,
             predicted=predicted,
-            settings=solver_settings(parameters),
+            settings=SolverSettings.of(parameters),
             faults=self._surroundings.faults,
             temperature_c=conditions.temperature_c,
             particles_s=conditions.particles_s,
@@ -280,14 +284,11 @@ class FrameCycle:
         )
 
     def _predict(self, mid_ns: int) -> Attitude | None:
-        """Return the predicted attitude; None until a rate is known, which takes two attitudes."""
-        last = self._rates.last
-        rate = self._rates.rate(self._rate_window)
-        if last is None or rate is None:
+        """Return the predicted attitude; None until a rate is known, because a wrong prediction costs a frame."""
+        rate = self._history.rate()
+        if rate is None:
             return None
-        if not self._parameters["prediction_enable"]:
-            return last[1]
-        return propagate(last[1], np.array(rate), (mid_ns - last[0]) / NANOSECONDS)
+        return self._history.predict(mid_ns, rate if self._parameters["prediction_enable"] else None)
 
     def _result_arrived(self, frame: _Frame, answer: PipelineReply) -> None:
         if isinstance(answer, FrameResult):
@@ -357,10 +358,11 @@ class FrameCycle:
         """Return the validity of a result after the checks of the device, the reason, and the rate."""
         if not result.valid:
             if frame.tracking:
-                self._rates.interrupt()
+                self._history.interrupt()
             return False, result.reason, None
-        self._rates.add(frame.mid_ns, Attitude(np.array(result.quaternion_xyzw)), frame.period_s)
-        rate = result.rate_rad_s or self._rates.rate(self._rate_window)
+        attitude = Attitude(np.array(result.quaternion_xyzw))
+        self._history.add(frame.mid_ns, attitude, LONGEST_GAP_PERIODS * frame.period_s)
+        rate = result.rate_rad_s or self._history.rate()
         if processing_s * 1000.0 > float(self._parameters["detection_timeout"]):
             return False, "timeout", rate
         if rate is not None and np.linalg.norm(rate) > np.radians(float(self._parameters["max_rate"])):

@@ -27,7 +27,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
 from starhil.emulator.sensor.pipeline.client import PipelineClient
 from starhil.emulator.sensor.pipeline.messages import IDENTITY, Quaternion
-from starhil.emulator.simulation.clock import NANOSECONDS, Clock, DeviceTime
+from starhil.emulator.simulation.clock import Clock, DeviceTime
 from starhil.emulator.simulation.guard import log_internal_error, one_line
 from starhil.emulator.simulation.output_file import Output
 from starhil.emulator.simulation.scheduler import Event, Scheduler
@@ -35,6 +35,7 @@ from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Field
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.icd.units_of_measure import factor
 from starhil.protocol.icd.values import Value
 
@@ -44,12 +45,11 @@ Background: TypeAlias = Callable[[Callable[[], None], Callable[[EmulatorError | 
 """Runs slow work (the first argument), then calls the second argument with the error or None."""
 
 PREDICTION_LIMIT_S: Final = 30.0
-"""Maximum age of an attitude from which tracking can start, seconds."""
+"""Maximum age of an attitude from which tracking can start, seconds (docs/rules.md, R14)."""
 
 STALE_PERIODS: Final = 3
-"""Number of update periods without a new measurement after which the last attitude is no longer valid."""
-
-PROCESSING_ALLOWANCE_S: Final = 2.0
+STALE_S: Final = 2.0
+"""An attitude is valid for at most `STALE_PERIODS` update periods and `STALE_S` after its result (docs/rules.md, R15)."""
 
 NOTHING_ACCEPTED: Final[Mapping[str, Mapping[str, Value]]] = MappingProxyType({})
 
@@ -92,9 +92,9 @@ class Device:
         self.clock = clock
         self.store = store
         self.signals = signals = Signals()
-        signals.frame_published.connect(self._frame_published)
-        signals.mode_changed.connect(self._mode_changed)
-        signals.parameters_changed.connect(self._parameters_changed)
+        signals.frame_published.connect(self._frame_published, first=True)
+        signals.mode_changed.connect(self._mode_changed, first=True)
+        signals.parameters_changed.connect(self._parameters_changed, first=True)
         self.scheduler = Scheduler()
         self.time = DeviceTime(clock)
         try:
@@ -313,7 +313,7 @@ class Device:
         last = self.latest
         if last is None or not self.modes.mode.makes_frames:
             return None
-        limit_s = STALE_PERIODS * last.period_s + PROCESSING_ALLOWANCE_S
+        limit_s = STALE_PERIODS * last.period_s + STALE_S
         age_ns = now_ns - last.published_ns
         return last if age_ns <= limit_s * NANOSECONDS else None
 

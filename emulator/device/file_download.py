@@ -13,7 +13,7 @@ from typing import Any, Final
 
 from starhil.emulator.device.images import ImageStore
 from starhil.emulator.device.stored_images import BMP_TYPE, FileState
-from starhil.emulator.simulation.clock import NANOSECONDS
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.image_transfer import (
     MAX_BLOCK,
     MAX_PACKETS,

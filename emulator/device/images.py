@@ -15,8 +15,9 @@ from starhil.emulator.device.signals import Signals
 from starhil.emulator.device.stored_images import ImageState, StoredImage
 from starhil.emulator.sensor.pipeline.client import PipelineClient, PipelineReply
 from starhil.emulator.sensor.pipeline.messages import IMAGE_EDGES, ImageRequest, ImageResult
-from starhil.emulator.simulation.clock import NANOSECONDS, DeviceTime
+from starhil.emulator.simulation.clock import DeviceTime
 from starhil.emulator.simulation.scheduler import Scheduler
+from starhil.protocol.icd.conventions import NANOSECONDS
 
 STORE_S: Final = 0.1
 """Modelled time to store an image, seconds."""

@@ -44,7 +44,7 @@ COMMANDED: Final[dict[Mode, frozenset[Mode]]] = {
     Mode.TRACKING: frozenset({Mode.STANDBY, Mode.LOST_IN_SPACE, Mode.TRACKING}),
     Mode.ERROR: frozenset({Mode.STANDBY}),
 }
-"""Mode → modes that can be commanded from it."""
+"""Mode → modes that can be commanded from it (docs/rules.md, R13)."""
 
 
 class Cause(StrEnum):

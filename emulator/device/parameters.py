@@ -7,11 +7,10 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
 from starhil.emulator.device.navigation import perigee_below_surface
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.sensor.pipeline.messages import SolverSettings
 from starhil.protocol.icd import FieldError, InterfaceDefinition
 from starhil.protocol.icd.codec import STRUCT_CODES
 from starhil.protocol.icd.values import MessageError, Parameter, Value
@@ -34,12 +33,6 @@ def exposure_period_s(parameters: Mapping[str, ParameterValue]) -> float:
     Read-out and processing overlap with the next exposure and do not count.
     """
     return (float(parameters["exposure"]) + float(parameters["delay_time"])) / 1000.0
-
-
-def solver_settings(parameters: Mapping[str, ParameterValue]) -> SolverSettings:
-    """Return the parameters that detection and identification use."""
-    chosen: dict[str, Any] = {name: parameters[name] for name in SolverSettings.__dataclass_fields__}
-    return SolverSettings(**chosen)
 
 
 def memory_format(definition: Parameter) -> str:

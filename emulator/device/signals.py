@@ -12,8 +12,9 @@
 Two parts that do not depend on the device have signals elsewhere: `Scheduler.added` wakes a sleeping pump, and
 `SensorPipeline.ended` starts the pipeline again.
 
-The sender changes its own state before it reports. Observers are called in the order in which the parts were made:
-first the device, so that every other part finds it up to date.
+The sender changes its own state before it reports. Observers are called in any order, except those that connect as
+`first`: the device, so that every other part finds it up to date, and the numbers of messages, which begin before the
+rows that report a start.
 """
 
 from __future__ import annotations

@@ -10,10 +10,10 @@ from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.device.signals import Signals
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.simulation.scheduler import Event, Scheduler
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.conventions import NANOSECONDS
 
 LONGEST_PERIOD_NS: Final = 1e18
 """Period of a row whose rate is hardly above zero, nanoseconds: longer than any run."""

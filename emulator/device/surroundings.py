@@ -12,9 +12,9 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
 from starhil.emulator.sensor.sky.radiation import particle_rate
 from starhil.emulator.sensor.sky.view import has_aberration
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.truth.orbit import Orbit
 from starhil.emulator.truth.source import TruthSource, TruthState
+from starhil.protocol.icd.conventions import NANOSECONDS
 
 log = logging.getLogger("starhil.device")
 

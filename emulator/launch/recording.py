@@ -5,27 +5,29 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.profile import Profile
+from starhil.emulator.profile.profile import PATHS
 from starhil.emulator.run.recorder import (
     RUN_FILE,
     SCENARIO_FILE,
     STATE_FOLDER,
 )
-from starhil.emulator.truth.config import FileConfig
 from starhil.protocol.files.validation import problems
 from starid.storage.files import read_text
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
-TRUTH_SOURCE_FILE: Final = "truth_source.csv"
+_COPIED: Final = [(key.split("."), mark.recorded_as) for key, mark in PATHS.items() if mark.recorded_as]
+"""Keys of files that a recording has a copy of, and the name of the copy."""
 
 
 class _RunFile(BaseModel):
@@ -56,9 +58,11 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     values = profile.model_dump(mode="json")
     # what the profile does not set is the unit's, which may have no dialects and another bit rate
     values["links"]["serial"] = profile.links.serial.model_dump(mode="json", exclude_unset=True)
-    if isinstance(profile.truth, FileConfig):
-        shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
-        values["truth"]["path"] = TRUTH_SOURCE_FILE
+    for keys, name in _COPIED:
+        table, key = _table_of(values, keys)
+        if key in table:
+            shutil.copyfile(profile.folder / table[key], folder / name)
+            table[key] = name
     state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
     if state is not None:
         values["run"]["state_dir"] = STATE_FOLDER
@@ -76,6 +80,14 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
 
 
+def _table_of(values: dict[str, Any], keys: Sequence[str]) -> tuple[dict[str, Any], str]:
+    """Return the table that may have a key, empty if there is none, and the last part of the key."""
+    *names, last = keys
+    for name in names:
+        values = values.get(name) or {}
+    return values, last
+
+
 def read_run(folder: Path) -> tuple[Profile, bool]:
     """Return the profile of a recording, and whether its tape ends with the entry `end`."""
     path = folder / RUN_FILE
@@ -84,10 +96,12 @@ def read_run(folder: Path) -> tuple[Profile, bool]:
     except EmulatorError as error:
         raise EmulatorError(f"{error}; give a folder made by starhil run --record") from None
     run = validated(_RunFile, text, path)
-    truth = run.profile.truth
-    if isinstance(truth, FileConfig):
-        truth = truth.model_copy(update={"path": str((folder / truth.path).absolute())})
-    profile = run.profile.model_copy(update={"truth": truth})
+    values = run.profile.model_dump(exclude_unset=True)
+    for keys, name in _COPIED:
+        table, key = _table_of(values, keys)
+        if table.get(key) == name:
+            table[key] = str((folder / name).absolute())
+    profile = Profile.model_validate(values)
     return profile.read_from(Path(run.folder) / RUN_FILE), run.ends
 
 

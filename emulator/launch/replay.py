@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
-
-from pydantic import Field, RootModel, model_validator
+from typing import Any, TypeVar
 
 from starhil.emulator.control.scenario import Scenario
 from starhil.emulator.device.device import Background, outcome
@@ -22,7 +19,6 @@ from starhil.emulator.launch.replay_differences import difference_of_truth, diff
 from starhil.emulator.links.traffic import Decoder, WireItem
 from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
-from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.run.head import Head
 from starhil.emulator.run.recorder import (
     EVENTS_FILE,
@@ -30,7 +26,20 @@ from starhil.emulator.run.recorder import (
     STATE_FOLDER,
     TRUTH_FILE,
     Done,
-    from_json,
+)
+from starhil.emulator.run.tape import (
+    ClearedFaults,
+    End,
+    Entry,
+    Event,
+    FeedMessage,
+    Line,
+    LinkItem,
+    NewFaults,
+    NewTruth,
+    PipelineAnswer,
+    PipelineState,
+    Stored,
 )
 from starhil.emulator.run.truth_log import TruthLog
 from starhil.emulator.run.wiring import Wiring
@@ -41,11 +50,11 @@ from starhil.emulator.sensor.pipeline.client import (
     ReplyCallback,
 )
 from starhil.emulator.sensor.pipeline.messages import PipelineEnded, PipelineReady
-from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock
+from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.simulation.guard import call_guarded
-from starhil.emulator.truth.config import Strict, TruthConfig
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 from starid.errors import StaridError
@@ -56,152 +65,6 @@ Item = TypeVar("Item", bytes, CanFrame)
 
 class _DeviationError(EmulatorError):
     """The device behaves differently, so that the recording cannot be played further."""
-
-
-class _Timed(Strict, ABC):
-    """An entry of the tape."""
-
-    ns: Annotated[int, Field(ge=0, lt=1 << 63)]
-
-    @abstractmethod
-    async def play(self, on: _Playing) -> None:
-        """Play the entry at the current time; _DeviationError if the device behaves differently, so that this is impossible."""
-
-
-class _Event(_Timed):
-    """An event that was due."""
-
-    do: Literal["event"]
-
-    async def play(self, on: _Playing) -> None:
-        due = on.head.device.scheduler.pop_due(on.player.clock.now_ns())
-        if due is None:
-            raise _DeviationError("no event is due")
-        call_guarded("event", due.action, due.due_ns)
-
-
-class _Reply(_Timed):
-    """A reply of the pipeline, or what took its place because the pipeline had ended."""
-
-    do: Literal["reply"]
-    ended: str | None = None
-
-    async def play(self, on: _Playing) -> None:
-        await on.pipeline.deliver(None if self.ended is None else PipelineEnded(self.ended))
-
-
-class _PipelineState(_Timed):
-    """The pipeline was ready, also after a restart; it ended, or was given up."""
-
-    do: Literal["ready", "pipeline_lost", "pipeline_given_up"]
-
-    async def play(self, on: _Playing) -> None:
-        match self.do:
-            case "ready":
-                on.head.pipeline_ready(on.warm)
-            case "pipeline_lost":
-                on.head.device.pipeline_lost()
-            case "pipeline_given_up":
-                on.head.device.pipeline_given_up()
-
-
-class _Stored(_Timed):
-    """The end of a slow write."""
-
-    do: Literal["stored"]
-
-    async def play(self, on: _Playing) -> None:
-        if not on.player.writes:
-            raise _DeviationError("nothing is being written")
-        on.player.writes.popleft()()
-
-
-class _Item(_Timed):
-    """An item on a link."""
-
-    do: Literal["in", "out"]
-    link: Literal["serial", "can", "canopen"]
-    data: str | tuple[int, str, bool, bool]
-
-    @cached_property
-    def item(self) -> bytes | CanFrame:
-        """Serial bytes or a CAN frame."""
-        return from_json(self.data)
-
-    @model_validator(mode="after")
-    def _check_item(self) -> Self:
-        try:
-            is_serial = isinstance(self.item, bytes)
-        except ProtocolError as error:
-            raise ValueError(str(error)) from None
-        if is_serial != (self.link == "serial"):
-            raise ValueError(f"data: not that of the link {self.link}")
-        return self
-
-    async def play(self, on: _Playing) -> None:
-        receive = on.player.receivers.get(self.link)
-        if receive is None:
-            raise _DeviationError(f"the link {self.link} is off")
-        on.player.pass_item(self.link, self.item, outgoing=False)
-        receive(self.item)
-
-
-class _Feed(_Timed):
-    """A message of a simulator."""
-
-    do: Literal["feed"]
-    data: Annotated[str, Field(pattern=r"^[\x00-\xff]*$")]
-
-    async def play(self, on: _Playing) -> None:
-        if on.truth.feed is None:
-            raise _DeviationError("there is no live feed")
-        await on.truth.feed.process(self.data.encode("latin-1"))
-
-
-class _Truth(_Timed):
-    """A new truth."""
-
-    do: Literal["truth"]
-    config: TruthConfig
-    start_s: Annotated[float, Field(ge=-1e9, le=1e9)]
-
-    async def play(self, on: _Playing) -> None:
-        await on.truth.set(self.config, self.start_s)
-
-
-class _Fault(_Timed):
-    """New faults."""
-
-    do: Literal["fault"]
-    request: FaultRequest
-
-    async def play(self, on: _Playing) -> None:
-        on.head.faults.inject(self.request)
-
-
-class _ClearFaults(_Timed):
-    """The end of all faults."""
-
-    do: Literal["clear_faults"]
-
-    async def play(self, on: _Playing) -> None:
-        on.head.faults.clear()
-
-
-class _End(_Timed):
-    """The end of the run."""
-
-    do: Literal["end"]
-
-    async def play(self, on: _Playing) -> None:
-        on.ended = True
-
-
-Entry = _Event | _Reply | _PipelineState | _Stored | _Item | _Feed | _Truth | _Fault | _ClearFaults | _End
-
-
-class _Line(RootModel[Annotated[Entry, Field(discriminator="do")]]):
-    """A line of the tape."""
 
 
 class Player(Wiring):
@@ -333,7 +196,7 @@ def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
             if not line.endswith(b"\n"):
                 return  # the run was killed while it wrote
             where = f"{path}: line {number}"
-            entry = validated(_Line, line, where).root
+            entry = validated(Line, line, where).root
             if entry.ns < last_ns:
                 why = f"time {entry.ns} ns is before that of the entry above, {last_ns} ns; the recording is damaged"
                 raise EmulatorError(f"replay {where}: {why}")
@@ -413,14 +276,14 @@ class _Playing:
         recording: list[WireItem] = []
         stepped = self.player.stepped
         for where, entry in read_events(folder):
-            if isinstance(entry, _Item):
+            if isinstance(entry, LinkItem):
                 outgoing = entry.do == "out"
                 recording.append(WireItem(entry.ns / NANOSECONDS, entry.link, outgoing, entry.item))
                 if outgoing:
                     continue
             stepped.set_ns(entry.ns)
             try:
-                await entry.play(self)
+                await self._play(entry)
             except _DeviationError as deviation:
                 at = f"at {entry.ns / NANOSECONDS:.6f} s the device behaves differently"
                 report.differences.append(f"{where}: {at}: {deviation}")
@@ -433,3 +296,49 @@ class _Playing:
                 f"{folder / EVENTS_FILE}: truncated at {stepped.now_ns() / NANOSECONDS:.6f} s: the run was killed, or lines are missing"
             )
         return recording
+
+    async def _play(self, entry: Entry) -> None:
+        """Play an entry at the current time; _DeviationError if the device behaves differently, so that this is impossible."""
+        device, player = self.head.device, self.player
+        match entry:
+            case Event():
+                due = device.scheduler.pop_due(player.clock.now_ns())
+                if due is None:
+                    raise _DeviationError("no event is due")
+                call_guarded("event", due.action, due.due_ns)
+            case PipelineAnswer():
+                await self.pipeline.deliver(None if entry.ended is None else PipelineEnded(entry.ended))
+            case PipelineState(do="ready"):
+                self.head.pipeline_ready(self.warm)
+            case PipelineState(do="pipeline_lost"):
+                device.pipeline_lost()
+            case PipelineState():
+                device.pipeline_given_up()
+            case Stored():
+                if not player.writes:
+                    raise _DeviationError("nothing is being written")
+                player.writes.popleft()()
+            case End():
+                self.ended = True
+            case _:
+                await self._play_input(entry)
+
+    async def _play_input(self, entry: LinkItem | FeedMessage | NewTruth | NewFaults | ClearedFaults) -> None:
+        """Play what came from outside, as `_play` does."""
+        match entry:
+            case LinkItem():
+                receive = self.player.receivers.get(entry.link)
+                if receive is None:
+                    raise _DeviationError(f"the link {entry.link} is off")
+                self.player.pass_item(entry.link, entry.item, outgoing=False)
+                receive(entry.item)
+            case FeedMessage():
+                if self.truth.feed is None:
+                    raise _DeviationError("there is no live feed")
+                await self.truth.feed.process(entry.data.encode("latin-1"))
+            case NewTruth():
+                await self.truth.set(entry.config, entry.start_s)
+            case NewFaults():
+                self.head.faults.inject(entry.request)
+            case ClearedFaults():
+                self.head.faults.clear()

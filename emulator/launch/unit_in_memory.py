@@ -22,14 +22,16 @@ from starhil.emulator.run import Run
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.run.head import Head
 from starhil.emulator.run.pump import MAX_STEP_S
+from starhil.emulator.run.tape import ClearedFaults, NewFaults
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.client import WorkerClient
 from starhil.emulator.sensor.pipeline.error_model import ErrorModel
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
-from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock
+from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.truth.config import TruthConfig
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 
@@ -260,12 +262,12 @@ class UnitUnderTest:
     def fault(self, fault: Mapping[str, Any]) -> None:
         """Inject faults, a request as on the control channel."""
         request = FaultRequest.model_validate(dict(fault))
-        self.run.record("fault", request=request.model_dump(mode="json"))
+        self.run.record(NewFaults, request=request)
         self.head.faults.inject(request)
 
     def clear_faults(self) -> None:
         """End all faults."""
-        self.run.record("clear_faults")
+        self.run.record(ClearedFaults)
         self.head.faults.clear()
 
     async def end_pipeline(self) -> None:

@@ -13,10 +13,10 @@ from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.wire_faults import Damage, WireFaults
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.simulation.scheduler import Event
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import ErrorCode, LinkFault, Receiver, Reply, Request
+from starhil.protocol.icd.conventions import NANOSECONDS
+from starhil.protocol.messages import DEFAULT_TIMEOUT_S, ErrorCode, LinkFault, Receiver, Reply, Request
 from starhil.protocol.transports.base import Transport
 
 Item = TypeVar("Item")
@@ -24,8 +24,8 @@ Style = TypeVar("Style")
 
 log = logging.getLogger("starhil.link")
 
-FLUSH_S: Final = 0.51
-"""Delay after which an incomplete message is dropped, seconds; just above the receivers' timeout, 0.5 s."""
+FLUSH_MARGIN_S: Final = 0.01
+"""An incomplete message is dropped this much later than the receiver's timeout."""
 
 
 @dataclass
@@ -94,6 +94,9 @@ AnyLink: TypeAlias = Link[Any]
 
 class RequestLink(Link[Item], Generic[Item, Style]):
     """Passes requests from a transport to the device, and replies back, in order."""
+
+    _timeout_s: float = DEFAULT_TIMEOUT_S
+    """Silence after which the receiver abandons an incomplete message."""
 
     def __init__(
         self, requests: Requests, transport: Transport[Item], damage: Damage[Item], seed: int
@@ -188,7 +191,7 @@ class RequestLink(Link[Item], Generic[Item, Style]):
     def _schedule_flush(self) -> None:
         """Schedule a flush while a message is incomplete."""
         if self._timer is None and self._receiver.busy:
-            due_ns = self._device.clock.now_ns() + round(FLUSH_S * NANOSECONDS)
+            due_ns = self._device.clock.now_ns() + round((self._timeout_s + FLUSH_MARGIN_S) * NANOSECONDS)
             self._timer = self._device.scheduler.at(due_ns, self._flush)
 
     def _flush(self, _due_ns: int) -> None:

@@ -20,7 +20,6 @@ from starhil.emulator.links.base import Link
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanDamage
 from starhil.emulator.sensor.pipeline.messages import ImageResult
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
@@ -33,6 +32,7 @@ from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, ParameterStorage, StorageError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.icd.values import MessageError, Value
 from starhil.protocol.messages import Reply
 from starhil.protocol.transports.base import Transport

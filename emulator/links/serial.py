@@ -53,12 +53,13 @@ class SerialLink(RequestLink[bytes, Dialect | None]):
     ) -> None:
         self._console = console
         self._stack = SerialStack(requests.device.icd)
+        self._timeout_s = self._stack.link.timeout
         super().__init__(requests, transport, SerialDamage(), seed)
         self._port = transport
         self._baud = self._wanted_baud()
         self._numbered = 0
         """Messages that the device has numbered since its start."""
-        self._device.signals.started.connect(self._restart_numbers)
+        self._device.signals.started.connect(self._restart_numbers, first=True)
         self._device.signals.parameters_changed.connect(self._parameters_changed)
 
     def _restart_numbers(self, _cause: str) -> None:

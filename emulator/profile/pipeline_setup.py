@@ -7,8 +7,9 @@ from typing import TypeAlias
 from starhil.emulator.profile.profile import Profile
 from starhil.emulator.sensor.pipeline.client import WorkerClient
 from starhil.emulator.sensor.pipeline.error_model import ErrorModel
-from starhil.emulator.sensor.pipeline.messages import PipelineSetup
+from starhil.emulator.sensor.pipeline.messages import PipelineSetup, SolverSettings
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess, WorkerThread
+from starhil.protocol.icd.device_model import device_model
 
 SensorPipeline: TypeAlias = WorkerClient | ErrorModel
 """An image pipeline that can be started, and started again after an unexpected end."""
@@ -39,6 +40,7 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
         catalog_path=str(profile.folder / path) if path else "",
         epoch=profile.epoch,
         algorithm=profile.run.algorithm,
+        settings=SolverSettings.of({name: item.default for name, item in device_model().parameters.items()}),
         seed=profile.run.seed,
         build_in_background=profile.run.clock != "stepped" and not repeatable,
         previews=previews,

@@ -40,6 +40,7 @@ from starhil.emulator.truth.config import (
     Strict,
     TruthConfig,
     UserPath,
+    profile_paths,
 )
 from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError, remedy
 from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled_units, find, not_found
@@ -180,9 +181,7 @@ CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1"
 OF_CAMERA: Final = CALIBRATION | {"limiting_magnitude"}
 """Device parameters that are not inherited by a profile with another camera."""
 
-PATHS: Final = frozenset(
-    {"truth.path", "orbit.path", "catalog.path", "images.folder", "images.dark", "run.state_dir"}
-)
+PATHS: Final = profile_paths(Profile)
 """Keys of files and folders, which refer to the folder of the profile that has them."""
 
 _A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"

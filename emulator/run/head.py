@@ -37,6 +37,7 @@ from starhil.emulator.run.faults import Faults
 from starhil.emulator.run.pump import ClockPump
 from starhil.emulator.run.recorder import Recorder
 from starhil.emulator.run.revival import PipelineRevival
+from starhil.emulator.run.tape import PipelineState
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.messages import PipelineReady, camera_constants
 from starhil.emulator.simulation.clock import Clock, SteppedClock
@@ -241,7 +242,7 @@ class Head:
 
     def _record(self, kind: str) -> None:
         if self._recorder is not None:
-            self._recorder.enter(kind)
+            self._recorder.enter(PipelineState, do=kind)
 
     def _mode_changed(self, transition: Transition) -> None:
         if transition.before is Mode.BOOT:

@@ -10,10 +10,12 @@ from typing import Any, Final
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.run.recorder import Recorder
+from starhil.emulator.run.tape import Event as EventEntry
 from starhil.emulator.sensor.pipeline.client import PipelineClient
-from starhil.emulator.simulation.clock import NANOSECONDS, Clock, LatchedClock, SteppedClock
+from starhil.emulator.simulation.clock import Clock, LatchedClock, SteppedClock
 from starhil.emulator.simulation.guard import call_guarded
 from starhil.emulator.simulation.scheduler import Event, Scheduler
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
 
 log = logging.getLogger("starhil.run")
@@ -75,7 +77,7 @@ class ClockPump:
         event = self._scheduler.pop_due(self._clock.now_ns())
         try:
             if event is not None and self._recorder is not None:
-                self._recorder.write("event")
+                self._recorder.write(EventEntry)
             if event is not None:  # one at a time, so that the links run in between
                 call_guarded("event", event.action, event.due_ns)
         finally:
@@ -126,7 +128,7 @@ class StepPump:
                 events += 1
                 self._clock.set_ns(max(event.due_ns, self._clock.now_ns()))
                 if self._recorder is not None:
-                    self._recorder.write("event")
+                    self._recorder.write(EventEntry)
                 call_guarded("event", event.action, event.due_ns)
                 await self._settle()
             self._clock.set_ns(end_ns)

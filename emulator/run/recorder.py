@@ -10,7 +10,6 @@ line, in order, the last one `end`), `truth.csv` (truth log), and other files th
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any, Final, TypeVar
 
 from starhil.emulator.device.device import Background
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.run.tape import End, LinkItem, PipelineAnswer, Stored, TimedEntry
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.client import (
     PipelineClient,
@@ -40,21 +40,6 @@ EVENTS_FILE: Final = "events.jsonl"
 TRUTH_FILE: Final = "truth.csv"
 SCENARIO_FILE: Final = "scenario.json"
 STATE_FOLDER: Final = "state"
-
-
-def as_json(item: bytes | CanFrame) -> Any:
-    """Return an item of a link as JSON."""
-    if isinstance(item, CanFrame):
-        return [item.id, item.data.hex(), item.extended, item.remote]
-    return item.hex()
-
-
-def from_json(value: Any) -> bytes | CanFrame:
-    """Return the item of a link from the value made by `as_json`."""
-    if isinstance(value, str):
-        return bytes.fromhex(value)
-    number, data, extended, remote = value
-    return CanFrame(number, bytes.fromhex(data), extended, remote)
 
 
 class Recorder(Wiring):
@@ -97,16 +82,16 @@ class Recorder(Wiring):
         if self._latched is not None:
             self._latched.latch()
 
-    def enter(self, kind: str, **values: Any) -> None:
-        """Set the clock to the current time, and write an entry."""
+    def enter(self, entry: type[TimedEntry], **values: Any) -> None:
+        """Set the clock to the current time, and write an entry with these values."""
         self.latch()
-        self.write(kind, **values)
+        self.write(entry, **values)
 
-    def write(self, kind: str, **values: Any) -> None:
-        """Write a line with the time of the clock."""
+    def write(self, entry: type[TimedEntry], **values: Any) -> None:
+        """Write an entry with the time of the clock."""
         if self.file is not None:
-            entry = {"ns": self.clock.now_ns(), "do": kind, **values}
-            self.file.append(lambda: json.dumps(entry).encode() + b"\n")
+            ns = self.clock.now_ns()
+            self.file.append(lambda: entry(ns=ns, **values).line())
 
     def serial(self, name: str, make: Callable[[], SerialTransport]) -> SerialTransport:
         """Return the transport of a link that carries bytes, whose items are recorded."""
@@ -129,7 +114,7 @@ class Recorder(Wiring):
         def background(work: Callable[[], None], done: Done) -> None:
             def ended(error: EmulatorError | None) -> None:
                 def entry() -> None:
-                    self.enter("stored")
+                    self.enter(Stored)
                     done(error)
 
                 self.when_open(entry)
@@ -140,7 +125,7 @@ class Recorder(Wiring):
 
     def end(self) -> None:
         """Write the last entry, without which the tape is truncated."""
-        self.write("end")
+        self.write(End)
 
     def discard(self) -> None:
         """Remove the folder, whose content this run has made, because the run was rejected."""
@@ -162,13 +147,13 @@ class _RecordedTransport(Transport[Item]):
 
     def _received(self, item: Item) -> None:
         def entry() -> None:
-            self._recorder.enter("in", link=self._name, data=as_json(item))
+            self._recorder.enter(LinkItem, do="in", link=self._name, data=LinkItem.data_of(item))
             self._receive(item)
 
         self._recorder.when_open(entry)
 
     def send(self, item: Item) -> bool:
-        self._recorder.write("out", link=self._name, data=as_json(item))
+        self._recorder.write(LinkItem, do="out", link=self._name, data=LinkItem.data_of(item))
         return self._inner.send(item)
 
     async def drain(self) -> None:
@@ -202,8 +187,9 @@ class _RecordedPipeline:
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         def arrived(reply: PipelineReply) -> None:
-            ended = {"ended": reply.text} if isinstance(reply, PipelineEnded) else {}
-            self._recorder.enter("reply", **ended)
+            self._recorder.enter(
+                PipelineAnswer, ended=reply.text if isinstance(reply, PipelineEnded) else None
+            )
             done(reply)
 
         self._inner.submit(request, arrived)

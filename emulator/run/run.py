@@ -20,6 +20,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from starhil.emulator.errors import EmulatorError
@@ -28,12 +29,14 @@ from starhil.emulator.profile.pipeline_setup import SensorPipeline, make_pipelin
 from starhil.emulator.run.head import Head, check_links
 from starhil.emulator.run.pump import StepPump
 from starhil.emulator.run.recorder import Recorder
+from starhil.emulator.run.tape import FeedMessage, NewTruth, TimedEntry
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
-from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock, make_clock
+from starhil.emulator.simulation.clock import SteppedClock, make_clock
 from starhil.emulator.simulation.guard import close_all
 from starhil.emulator.truth.truth import Truth, TruthHost
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.unit import load_unit
 from starhil.protocol.unit.examples import served
 
@@ -71,7 +74,8 @@ class Run:
             self.profile.start_unix_s,
             self.time_passes,
             self._step_in_lock,
-            self.record,
+            partial(self.record, NewTruth),
+            partial(self.record, FeedMessage),
             not self.wiring.plays,
         )
         self.truth = Truth(self.profile.truth, self.profile.folder, host)
@@ -128,10 +132,10 @@ class Run:
         for head in self.heads:
             head.start_time()
 
-    def record(self, kind: str, **values: Any) -> None:
+    def record(self, entry: type[TimedEntry], **values: Any) -> None:
         """Record an input that has arrived now, if the run is recorded."""
         if self.recorder is not None:
-            self.recorder.enter(kind, **values)
+            self.recorder.enter(entry, **values)
 
     async def _step_in_lock(self, seconds: float) -> None:
         """Advance the clock for a simulator; the events of a replay are on its tape."""

@@ -12,8 +12,8 @@ import numpy as np
 
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.sensor.pipeline.messages import as_quaternion
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.simulation.output_file import Output, OutputFile
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.attitude import Attitude
 
 COLUMNS: Final = (

@@ -15,8 +15,6 @@ from typing import Final, TypeAlias
 from starhil.emulator.errors import EmulatorError
 from starid.storage.files import read_number
 
-NANOSECONDS: Final = 1_000_000_000
-
 MAX_SCALE: Final = 1000.0
 
 

@@ -11,7 +11,7 @@ Message = TypeVar("Message")
 
 
 class Signal(Generic[Message]):
-    """Passes each message to its observers, in the order in which they were connected.
+    """Passes each message to its observers: to those that are connected as `first`, and then to the others, both in any order.
 
     An observer that fails is logged, and stops neither the sender nor the other observers.
     """
@@ -20,9 +20,9 @@ class Signal(Generic[Message]):
         self.name = name
         self.observers: list[Callable[[Message], object]] = []
 
-    def connect(self, observer: Callable[[Message], object]) -> None:
-        """Call a function with each further message."""
-        self.observers.append(observer)
+    def connect(self, observer: Callable[[Message], object], *, first: bool = False) -> None:
+        """Call a function with each further message; `first`: before those that rely on what it does."""
+        self.observers.insert(0 if first else len(self.observers), observer)
 
     def disconnect(self, observer: Callable[[Message], object]) -> None:
         """Call a function no more, if it is connected."""

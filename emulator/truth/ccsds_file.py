@@ -26,7 +26,6 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.feed_message import NORM_TOLERANCE
 from starhil.emulator.truth.source import MAX_RATE_DEG_S
 from starhil.emulator.truth.standard_frames import (
-    NANOSECONDS,
     Block,
     Row,
     euler_turns,
@@ -37,6 +36,7 @@ from starhil.emulator.truth.standard_frames import (
     unix_ns,
 )
 from starhil.emulator.truth.table import FileTruth, OrbitTable
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.storage.files import read_number

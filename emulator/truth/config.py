@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self, TypeAlias
+from typing import Annotated, Any, Final, Literal, Self, TypeAlias, get_args, get_origin
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -56,6 +57,35 @@ def _expanded(path: str) -> str:
 
 UserPath: TypeAlias = Annotated[str, AfterValidator(_expanded)]
 """A path as a user writes it, which may begin with `~`; expanded when it is read."""
+
+
+@dataclass(frozen=True)
+class InProfileFolder:
+    """Marks the key of a file or folder that refers to the folder of the profile that has it."""
+
+    recorded_as: str = ""
+    """Name of its copy in a recording; empty: a recording refers to the file itself."""
+
+
+def profile_paths(model: type[BaseModel]) -> dict[str, InProfileFolder]:
+    """Return the dotted keys of a model that are marked so, those of its tables included."""
+    found: dict[str, InProfileFolder] = {}
+    for name, field in model.model_fields.items():
+        for mark in field.metadata:
+            if isinstance(mark, InProfileFolder):
+                found[name] = mark
+        for table in _tables_in(field.annotation):
+            found |= {f"{name}.{key}": mark for key, mark in profile_paths(table).items()}
+    return found
+
+
+def _tables_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models of an annotation, but for those in lists."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    elif get_origin(annotation) is not list:
+        for part in get_args(annotation):
+            yield from _tables_in(part)
 
 
 class Strict(BaseModel):
@@ -271,7 +301,7 @@ class FileConfig(SourceConfig):
     """A file of attitudes: CSV, CCSDS AEM, STK `.a` or SPICE; a relative path refers to the profile's folder."""
 
     kind: Literal["file"]
-    path: UserPath
+    path: Annotated[UserPath, InProfileFolder(recorded_as="truth_source.csv")]
     """The file; its content says which format it has, see truth-files.md."""
     start: Literal["run", "now"] = "run"
     """Time zero of the file, which is the first useable date of a file with dates: the start of the run, or the time at
@@ -457,7 +487,7 @@ class OrbitFileConfig(Strict):
 
     kind: Literal["file"]
     """Selects this form of the orbit."""
-    path: UserPath
+    path: Annotated[UserPath, InProfileFolder(recorded_as="orbit_source")]
     """The file, see truth-files.md."""
 
     def build(self, start_unix_s: float, folder: Path) -> Orbit:  # noqa: ARG002 (one signature for all)

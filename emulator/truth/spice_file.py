@@ -23,8 +23,9 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.orbit import OrbitState
-from starhil.emulator.truth.standard_frames import NANOSECONDS, Block, Row, truth_of
+from starhil.emulator.truth.standard_frames import Block, Row, truth_of
 from starhil.emulator.truth.table import FileTruth
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.attitude import Attitude
 
 META_KERNEL: Final = "KPL/MK"

@@ -20,6 +20,7 @@ from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.plausibility import doubt_of_orbit
 from starhil.emulator.truth.source import Vector
 from starhil.emulator.truth.table import FileTruth, OrbitTable, Span
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.catalog.earth import utc_of_tai
@@ -27,7 +28,6 @@ from starid.catalog.earth import utc_of_tai
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-NANOSECONDS: Final = 1_000_000_000
 ICRS_NAMES: Final = ("ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "ICRS", "GCRS")
 J2000_NAMES: Final = ("EME2000", "J2000")
 """Mean equator and equinox of J2000, which differ from ICRS by the frame bias of 23 milliarcseconds."""

@@ -14,8 +14,9 @@ from typing import Final
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.ccsds_file import Segment, attitudes_of, orbit_of
-from starhil.emulator.truth.standard_frames import NANOSECONDS, unix_ns
+from starhil.emulator.truth.standard_frames import unix_ns
 from starhil.emulator.truth.table import FileTruth, OrbitTable
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.storage.files import read_number
 
 STK: Final = "stk.v."

@@ -17,12 +17,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.simulation.clock import NANOSECONDS, Clock, make_clock
+from starhil.emulator.simulation.clock import Clock, make_clock
 from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
 from starhil.emulator.truth.feed import LiveFeed, Step
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starhil.emulator.truth.table import FileTruth
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.attitude import Attitude
 
 
@@ -39,8 +40,9 @@ class TruthHost:
     """Set when every pipeline is ready."""
     step: Step
     """Advances the stepped clock, for lock-step."""
-    record: Callable[..., None]
-    """Records an entry on the tape, if there is one: its kind and values."""
+    record_truth: Callable[..., None]
+    record_message: Callable[..., None]
+    """Records a new truth, or a message of a feed, on the tape, if there is one, with the values of the entry."""
     opens_sockets: bool = True
     """Whether live feeds open sockets; the messages of a replay come from the tape."""
 
@@ -77,7 +79,7 @@ class Truth:
         """Replace the truth; its motion begins now, or at a simulation time, as in a recorded run."""
         loaded = await self._load(config, at_s)
         start_s = getattr(loaded[0], "start_s", self._host.now_s())
-        self._host.record("truth", config=config.model_dump(mode="json"), start_s=start_s)
+        self._host.record_truth(config=config, start_s=start_s)
         self.put(*loaded)
 
     def put(
@@ -138,7 +140,7 @@ class Truth:
 
     def _message_received(self, data: bytes) -> None:
         """Record a message of the feed; until time passes, each message replaces the earlier ones."""
-        self._host.record("feed", data=data.decode("latin-1"))
+        self._host.record_message(data=data.decode("latin-1"))
         live = None if self.feed is None else self.feed.truth
         if live is not None and live.timeline == "anchor" and not self._host.time_passes.is_set():
             live.begin_timeline()

@@ -33,7 +33,7 @@ PROCESSING_S: Final = 1.0
 """Longest time from the end of an exposure to its result."""
 STALE_PERIODS: Final = 3
 STALE_S: Final = 2.0
-"""An attitude is not reported longer than `STALE_PERIODS` update periods and `STALE_S` after its exposure."""
+"""An attitude is valid for at most `STALE_PERIODS` update periods and `STALE_S` after its result (docs/rules.md, R15)."""
 LONGEST_PERIOD_S: Final = 100.0
 """Longest update period that a unit can have."""
 KEPT_PERIODS: Final = 20

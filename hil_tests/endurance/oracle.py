@@ -433,7 +433,7 @@ class Oracle:
 
 _RUNNING: Final = frozenset({"standby", *IMAGING})
 _COMMANDED: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
-"""Modes that can be commanded from a mode; `_RUNNING` from all others."""
+"""Modes that can be commanded from a mode; `_RUNNING` from all others (docs/rules.md, R13)."""
 _TIMING: Final = frozenset({"update_rate", "exposure", "delay_time"})
 _ORBIT: Final = frozenset({"orbit_semi_major_axis", "orbit_eccentricity"})
 _BOUND: Final = _TIMING | _ORBIT | {"min_star_pixels", "max_star_pixels"}

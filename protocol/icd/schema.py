@@ -43,7 +43,7 @@ class UnitModel(DefinitionModel):
     source: str = ""
     """Public source of confirmed rows without a `source`."""
     first_telemetry_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
-    """Lowest telemetry ID; lower IDs are telecommands. Omit it if IDs do not distinguish them."""
+    """Lowest telemetry ID; lower IDs are telecommands. Omit it if IDs do not distinguish them; on CubeSpace's links it is 128."""
     provenance: Provenance | None = None
     """Default provenance of rows."""
     plugin: str | None = None

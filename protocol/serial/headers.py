@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
 from starhil.protocol.errors import IcdError, ProtocolError
-from starhil.protocol.icd.conventions import Order
+from starhil.protocol.icd.conventions import NANOSECONDS, Order
 from starhil.protocol.icd.link_schema import HeaderFieldModel
 
 WRAPPING: Final = frozenset(("ticks", "time", "sequence"))
 """Roles whose values wrap around."""
-NANOSECONDS: Final = 1_000_000_000
 
 
 class HeaderError(ProtocolError):

@@ -27,7 +27,7 @@ from starhil.protocol.icd.conventions import Conventions
 from starhil.protocol.icd.definition import OTHER_ERROR, Names
 from starhil.protocol.icd.link_schema import CubeSpaceFraming, LinkModel, MessageClass
 from starhil.protocol.icd.values import Located, MissingNameError, Parameter, Section
-from starhil.protocol.messages import ErrorCode, RequestKind
+from starhil.protocol.messages import FIRST_TELEMETRY_ID, ErrorCode, RequestKind
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial.formats import words
 from starhil.protocol.serial.stack import SerialStack
@@ -120,14 +120,15 @@ class _Reader:
         for file, item in self._tables["classes"]:
             with self._recording(f"{file}: class {item.name}", CLASS, item.name):
                 self._add_class(item)
+        link = self._single("link", LinkModel())
         self._icd = InterfaceDefinition(
             name=self._unit.name,
             version=self._unit.version,
             doc=self._unit.doc,
-            first_telemetry_id=self._unit.first_telemetry_id,
+            first_telemetry_id=self._first_telemetry_id(link),
             conventions=self._single("conventions", Conventions()),
             errors=self._single("errors", {}),
-            link=self._single("link", LinkModel()),
+            link=link,
             canopen=self._single("canopen", None),
             classes=tuple(self._classes.values()),
             plugin=self._read_plugin(run_plugin=run_plugin),
@@ -210,6 +211,30 @@ class _Reader:
         if unit is UNKNOWN_UNIT and not self._unread and UNIT not in self._broken:
             self.errors.append(f"{self._path}: no [unit] with name, version and doc")
         return unit
+
+    def _first_telemetry_id(self, link: LinkModel) -> int | None:
+        """Return the lowest telemetry ID, which CubeSpace's links fix."""
+        first = self._unit.first_telemetry_id
+        fixing = [
+            name
+            for name, fixes in (
+                (
+                    "link.serial",
+                    link.serial is not None and isinstance(link.serial.framing, CubeSpaceFraming),
+                ),
+                ("link.can", link.can is not None),
+            )
+            if fixes
+        ]
+        if not fixing or self._unit is UNKNOWN_UNIT:
+            return first
+        if first in (None, FIRST_TELEMETRY_ID):
+            return FIRST_TELEMETRY_ID
+        self.errors.append(
+            f"{self._file_of(UNIT)}: unit.first_telemetry_id: {first}, but {fixing[0]} is of CubeSpace, whose telemetry "
+            f"begins at {FIRST_TELEMETRY_ID}; set it to {FIRST_TELEMETRY_ID}"
+        )
+        return first
 
     def _read_plugin(self, *, run_plugin: bool) -> Plugin:
         if self._unit is UNKNOWN_UNIT:
@@ -389,7 +414,7 @@ class _Reader:
             raise IcdError(f"needs `class`, one of {', '.join(of_kind or self._classes)}")
 
     def _check_id(self, row: Row) -> None:
-        first = self._unit.first_telemetry_id
+        first = self._icd.first_telemetry_id
         if first is not None and (row.id >= first) != (row.kind == "telemetry"):
             side = f"{first} and up" if row.kind == "telemetry" else f"below {first}"
             raise IcdError(f"ID {row.id} is not a {row.kind} ID ({side})")

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from starid.arrays import Array
-from starid.attitude import Attitude, propagate, rate_between
+from starid.attitude import Attitude
 from starid.errors import StaridError
+from starid.identification.attitude_history import AttitudeHistory
 from starid.identification.solution import Solution
 from starid.identification.star_identifier import StarIdentifier
 
@@ -32,8 +33,6 @@ class Tracker:
 
     Attributes
     ----------
-    attitude : Attitude or None
-        Last valid attitude.
     rate_rad_s : ndarray (3,) or None
         Body rate in the sensor frame, from the last two valid attitudes.
     """
@@ -48,25 +47,28 @@ class Tracker:
         if not longest_gap_s > 0.0:
             raise StaridError(f"tracker longest_gap_s: must be seconds > 0, not {longest_gap_s}")
         self.identifier = identifier
-        self.attitude: Attitude | None = None
         self.rate_rad_s: Array | None = None
-        self._time_s = 0.0
+        self._history = AttitudeHistory(window=2)
         self._longest_gap_s = longest_gap_s
         self._window_px = window_px
 
+    @property
+    def attitude(self) -> Attitude | None:
+        """Last valid attitude."""
+        last = self._history.last
+        return None if last is None else last[1]
+
     def reset(self) -> None:
         """Forget attitude and rate, so that the next frame is identified lost in space."""
-        self.attitude = None
+        self._history.clear()
         self.rate_rad_s = None
 
     def predict(self, time_s: float) -> Attitude | None:
         """Predict the attitude at a time; None without a recent valid attitude."""
-        gap = time_s - self._time_s
-        if self.attitude is None or not 0.0 <= gap <= self._longest_gap_s:
+        last = self._history.last
+        if last is None or not 0.0 <= time_s - last[0] <= self._longest_gap_s:
             return None
-        if self.rate_rad_s is None:
-            return self.attitude
-        return propagate(self.attitude, self.rate_rad_s, gap)
+        return self._history.predict(time_s, self.rate_rad_s)
 
     def update(
         self,
@@ -113,10 +115,7 @@ class Tracker:
             solution = self.identifier.identify(xy_px, flux, xy_sigma_px, observer_velocity=observer_velocity)
             solution = dataclasses.replace(solution, elapsed=solution.elapsed + spent)
         if solution.valid:
-            gap = time_s - self._time_s
-            if self.attitude is not None and 0.0 < gap <= self._longest_gap_s:
-                self.rate_rad_s = rate_between(self.attitude, solution.attitude, gap)
-            else:
-                self.rate_rad_s = None
-            self.attitude, self._time_s = solution.attitude, time_s
+            self._history.add(time_s, solution.attitude, self._longest_gap_s)
+            rate = self._history.rate()
+            self.rate_rad_s = None if rate is None else np.array(rate)
         return dataclasses.replace(solution, rate_rad_s=self.rate_rad_s if solution.valid else None)

@@ -25,7 +25,6 @@ from starhil.emulator.sensor.pipeline.messages import (
     MatchedStar,
     as_quaternion,
 )
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.emulator.truth.source import FixedTruth
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
@@ -37,6 +36,7 @@ from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.files.bundled import DEFAULT_UNIT
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.paced import PacedTransport
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude

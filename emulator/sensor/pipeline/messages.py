@@ -6,7 +6,7 @@ import pickle
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, Self, TypeAlias
 
 from starhil.emulator.truth.source import TruthState
 from starid.arrays import Array
@@ -46,6 +46,36 @@ IMAGE_EDGES: Final = (1024, 512, 256, 128, 64)
 
 
 @dataclass(frozen=True)
+class SolverSettings:
+    """Device parameters used in detection and identification, named as in the interface definition."""
+
+    detection_threshold: float
+    star_threshold: float
+    max_star_pixels: int
+    min_star_pixels: int
+    limiting_magnitude: float
+    max_stars_matched: int
+    min_stars_matched: int
+    error_margin: int
+    window_width: int
+    tracking_margin: int
+    validation_margin: int
+    search_width: float
+    centroid_x: float
+    centroid_y: float
+    focal_length: float
+    k1: float
+    k2: float
+    p1: float
+    p2: float
+
+    @classmethod
+    def of(cls, parameters: Mapping[str, Any]) -> Self:
+        """Take the settings from the values of all parameters."""
+        return cls(**{name: parameters[name] for name in cls.__dataclass_fields__})
+
+
+@dataclass(frozen=True)
 class PipelineSetup:
     """Configuration of the pipeline, fixed for a run."""
 
@@ -58,6 +88,8 @@ class PipelineSetup:
     epoch: float
     """Catalogue file (empty: the installed one) and the Julian year of the star positions."""
     algorithm: str
+    settings: SolverSettings
+    """Settings of the frames with which the pipeline is warmed up, apart from the camera's constants."""
     seed: int
     build_in_background: bool = False
     """Whether frames are solved with the current star index while another is being built. If false, frames wait for
@@ -71,31 +103,6 @@ class PipelineSetup:
     exact."""
     images: dict[str, Any] = field(default_factory=dict)
     """Source of images instead of rendering: keys of `[images]` in a profile."""
-
-
-@dataclass(frozen=True)
-class SolverSettings:
-    """Device parameters used in detection and identification, named as in the interface definition."""
-
-    detection_threshold: float = 5.0
-    star_threshold: float = 3.0
-    max_star_pixels: int = 250
-    min_star_pixels: int = 2
-    limiting_magnitude: float = 6.0
-    max_stars_matched: int = 60
-    min_stars_matched: int = 4
-    error_margin: int = 100
-    window_width: int = 21
-    tracking_margin: int = 6
-    validation_margin: int = 2
-    search_width: float = 10.0
-    centroid_x: float = 468.0
-    centroid_y: float = 468.0
-    focal_length: float = 1220.4842
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
 
 
 def camera_constants(camera: Mapping[str, Any]) -> dict[str, Any]:
@@ -131,11 +138,11 @@ class FrameRequest:
     """Truth of the sensor at mid-exposure; without a date, only typed bodies are rendered."""
     exposure_s: float
     gain: float
+    settings: SolverSettings
     solve: bool = True
     """Whether to detect and identify stars; if false, the image is only rendered and kept for download."""
     predicted: Attitude | None = None
     """Predicted attitude at mid-exposure, for tracking; None: lost in space."""
-    settings: SolverSettings = field(default_factory=SolverSettings)
     faults: dict[str, Any] = field(default_factory=dict)
     """Fields of the sky objects that are overridden by the control channel."""
     temperature_c: float | None = None

@@ -134,7 +134,7 @@ class Pipeline:
         Compiling a kernel during a run would interrupt frames for seconds, so some frames here have star
         trails. A `helper` that compiles the star identifier is waited for.
         """
-        settings = replace(SolverSettings(), **camera_constants(self.camera.to_dict()))
+        settings = replace(self._setup.settings, **camera_constants(self.camera.to_dict()))
         attitude = Attitude.identity()
         request = FrameRequest(
             index=0,

@@ -12,7 +12,7 @@ import pytest
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.profile.pipeline_setup import pipeline_setup
-from starhil.emulator.sensor.pipeline.messages import Failure, FrameRequest, SolverSettings
+from starhil.emulator.sensor.pipeline.messages import Failure, FrameRequest, SolverSettings, camera_constants
 from starhil.emulator.sensor.pipeline.pipeline import Pipeline
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starhil.protocol.files.bundled import bundled_units
@@ -132,11 +132,9 @@ def test_an_extreme_telecommand_is_answered_and_telemetry_can_be_read(make_bench
 @pytest.fixture(scope="module")
 def solve():
     """Solve one rendered image with given settings; the image is rendered once."""
-    pipeline = Pipeline(dataclasses.replace(pipeline_setup(Profile()), build_in_background=False))
-    camera = pipeline.camera
-    nominal = SolverSettings(
-        focal_length=camera.focal_px[0], centroid_x=camera.centre_px[0], centroid_y=camera.centre_px[1]
-    )
+    setup = dataclasses.replace(pipeline_setup(Profile()), build_in_background=False)
+    pipeline = Pipeline(setup)
+    nominal = dataclasses.replace(setup.settings, **camera_constants(pipeline.camera.to_dict()))
     request = FrameRequest(0, TruthState(ORION, ZERO_RATE), exposure_s=0.1, gain=1.0, settings=nominal)
     assert pipeline.handle(request).valid
     exposure = pipeline._last

@@ -23,6 +23,7 @@ from starhil.emulator.simulation.clock import SteppedClock
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.files.bundled import bundled_units
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.device_model import generic
 from starhil.protocol.messages import FaultKind, LinkFault
 
 TICK_NS = 1000
@@ -134,8 +135,8 @@ def values_of(shot: Snapshot, icd: InterfaceDefinition) -> dict[str, object]:
     """Return all quantities of a snapshot."""
     values = {}
     names = [f"parameter.{name}" for name in icd.device_parameters] + ["health.board"]
-    for name, quantity in QUANTITIES.items():
-        count = quantity.declared.count
+    for name in QUANTITIES:
+        count = icd.model.quantities[name].count
         names += [name] if count is None else [name.replace("[n]", f"[{n}]") for n in range(1, count + 1)]
     for name in names:
         try:
@@ -157,6 +158,24 @@ def test_no_quantity_can_reach_a_device_or_a_clock(passing, unit):
     assert shot.frame.valid
     assert shot.file is not None
     assert list(reachable(shot, "snapshot")) == []
+
+
+PYTHON_TYPES = {"bool": bool, "int": int, "float": float, "text": str, "bytes": bytes}
+
+
+def test_values_have_the_types_that_the_model_declares(passing):
+    bench = passing()
+    bench.command("save_image", image_size="size_64")
+    bench.step(1.3)
+    values = values_of(bench.device.snapshot(), bench.icd)
+    declared = {name: PYTHON_TYPES[item.type] for name, item in bench.icd.model.quantities.items()}
+    declared |= {name: declared[generic(name)] for name in values if "[" in name}
+    wrong = {
+        name: value
+        for name, value in values.items()
+        if name in declared and value is not None and type(value) is not declared[name]
+    }
+    assert wrong == {}
 
 
 def test_a_door_to_the_device_would_be_found(passing):

@@ -6,7 +6,10 @@ import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
+from starhil.emulator.sensor.pipeline.messages import camera_constants
+from starhil.protocol.icd.device_model import device_model
 from starhil.protocol.messages import ErrorCode
+from starid.camera import DEFAULT_CAMERA, Camera
 
 F32 = 1e-6
 
@@ -162,3 +165,10 @@ def test_a_profile_may_give_the_device_another_idea_of_its_camera(make_bench):
     bench.device.pipeline_ready({"focal_length": 1220.0, "k1": 0.01})
     assert bench.device.parameters["focal_length"] == 1230.0
     assert bench.device.parameters["k1"] == pytest.approx(0.01)
+
+
+def test_the_camera_of_a_profile_and_the_defaults_of_the_model_are_the_camera_of_starid():
+    assert Camera.from_dict(Profile().camera.values()) == DEFAULT_CAMERA
+    defaults = {name: item.default for name, item in device_model().parameters.items()}
+    constants = camera_constants(DEFAULT_CAMERA.to_dict())
+    assert {name: defaults[name] for name in constants} == pytest.approx(constants, rel=F32)

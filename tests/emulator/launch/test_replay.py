@@ -600,6 +600,7 @@ def test_a_run_with_truth_and_orbit_from_standard_files_is_repeated(record, tmp_
         orbit={"kind": "file", "path": str(tmp_path / "orbit")},
     )
     (tmp_path / "truth").unlink()
+    (tmp_path / "orbit").unlink()
     assert report_of(folder).differences == []
     assert seen[0] == (1774008002.0, pytest.approx(15_000.0, abs=1.0))
 

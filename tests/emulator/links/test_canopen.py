@@ -20,10 +20,10 @@ from starhil.emulator.links.canopen import (
     open_canopen,
     rows_reporting,
 )
-from starhil.emulator.simulation.clock import NANOSECONDS
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.context import NmtState
 from starhil.protocol.canopen.storage import FileStorage, ParameterStorage
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.unit import load_unit
 

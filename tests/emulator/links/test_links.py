@@ -2,6 +2,7 @@
 
 import asyncio
 import random
+from dataclasses import replace
 
 import pytest
 
@@ -452,3 +453,19 @@ def test_the_same_commands_give_the_same_bytes(make_bench):
     first = run()
     assert len(first) > 10_000
     assert first == run()
+
+
+def test_an_incomplete_message_is_abandoned_after_the_timeout_of_the_unit(bench):
+    async def scenario():
+        serial = bench.icd.link.serial.model_copy(update={"timeout": 0.1})
+        bench.device.icd = replace(bench.icd, link=bench.icd.link.model_copy(update={"serial": serial}))
+        linked = await Linked(bench).start()
+        linked.uart.arrive(b"\x1f\x7f\x80")
+        bench.step(0.1)
+        assert bench.device.counters.flags == set()
+        bench.step(0.02)
+        assert bench.device.counters.flags == {"uart_incomplete"}
+        await linked.serial.close()
+        await linked.can.close()
+
+    in_loop(scenario())

@@ -29,7 +29,7 @@ SCATTERED = 100
 
 def errors_arcsec(pipeline, parameters) -> list[float]:
     """Errors across the boresight in a few random fields."""
-    settings = SolverSettings(**{name: parameters[name] for name in SolverSettings.__dataclass_fields__})
+    settings = SolverSettings.of(parameters)
     rng = np.random.default_rng(7)
     errors = []
     for index in range(FIELDS):
@@ -61,7 +61,7 @@ def test_bright_stars_that_a_wrong_calibration_keeps_out_of_the_solution_are_not
     profile, icd = load_profile("cubestar", ["run.clock=stepped"]), load_unit()
     pipeline = Pipeline(pipeline_setup(profile))
     parameters = Parameters(icd, profile_defaults(profile, icd))
-    settings = SolverSettings(**{name: parameters[name] for name in SolverSettings.__dataclass_fields__})
+    settings = SolverSettings.of(parameters)
     truth = TruthState(Attitude.from_radec_roll(83.8, -1.2, 0.0), ZERO_RATE)
     unused = set()
     for index in range(5):
@@ -74,16 +74,17 @@ def test_bright_stars_that_a_wrong_calibration_keeps_out_of_the_solution_are_not
 
 
 def test_what_is_known_of_a_wrong_calibration_changes_the_stated_uncertainty_only():
-    known, unknown = (
-        Pipeline(pipeline_setup(load_profile("cubestar", overrides)))
+    setups = [
+        pipeline_setup(load_profile("cubestar", overrides))
         for overrides in ([], ["calibration.sigma=[0, 0, 0, 0, 0, 0, 0, 0, 0]"])
-    )
+    ]
+    known, unknown = map(Pipeline, setups)
     request = FrameRequest(
         0,
         TruthState(Attitude.from_radec_roll(83.8, -1.2, 0.0), ZERO_RATE),
         0.3,
         1.0,
-        settings=SolverSettings(),
+        settings=setups[0].settings,
     )
     stated, noise = known.handle(request), unknown.handle(request)
     assert stated.quaternion_xyzw == noise.quaternion_xyzw

@@ -401,8 +401,7 @@ def test_one_byte_of_data_is_not_taken_for_a_refusal():
 
 def report(monkeypatch, quantity, value):
     """Let the device report a value of a quantity, whatever its state."""
-    wrong = replace(QUANTITIES[quantity], function=lambda _shot: value)
-    monkeypatch.setitem(QUANTITIES, quantity, wrong)
+    monkeypatch.setitem(QUANTITIES, quantity, lambda _shot: value)
 
 
 def test_a_parameter_is_followed_by_its_selection(monkeypatch):

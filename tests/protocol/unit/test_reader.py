@@ -411,6 +411,8 @@ def test_every_default_survives_the_wire(parameter: object) -> None:
 HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "d"\nfirst_telemetry_id = 128\n'
 
 
+CUBESPACE_CAN = '[link.can]\nkind = "cubespace"\n'
+CUBESPACE_SERIAL = '[link.serial]\nframing = { kind = "cubespace" }\n'
 CANOPEN = """[canopen]
 device_type = 0
 device_name = "n"
@@ -436,6 +438,12 @@ def _row(
 
 
 BAD_DEFINITIONS = [
+    ("another lowest telemetry ID than that of CubeSpace's CAN", HEAD.replace("128", "64") + CUBESPACE_CAN,
+     r"unit\.first_telemetry_id: 64, but link\.can is of CubeSpace, whose telemetry begins at 128; set it to 128"),
+    ("another lowest telemetry ID than that of CubeSpace's framing", HEAD.replace("128", "64") + CUBESPACE_SERIAL,
+     r"unit\.first_telemetry_id: 64, but link\.serial is of CubeSpace, whose telemetry begins at 128; set it to 128"),
+    ("telemetry ID that CubeSpace's CAN has for telecommands",
+     HEAD.replace("first_telemetry_id = 128", "") + CUBESPACE_CAN + _row(identifier=5), r"ID 5 is not a telemetry ID \(128 and up\)"),
     ("unknown key", HEAD + _row('colour = "red"'), r"row\.colour"),
     ("unknown key of a field", HEAD + _row(fields='[{ name = "a", type = "u8", units = "m" }]'), r"row\.fields\.a\.units"),
     ("wrong type", HEAD + _row(fields='[{ name = "a", type = "u48" }]'), r"row\.fields\.a\.type"),

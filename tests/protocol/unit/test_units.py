@@ -157,7 +157,7 @@ INVALID = [
     ("answer with no such row", telecommand("", more='answer = ["row:stat"]') + telemetry('{ name = "a", type = "u8" }', "status"), "telecommand command: answer 'row:stat': no telemetry row named 'stat'; did you mean status"),
     ("unknown answer of telemetry", telemetry("", more='answer = ["ecko"]'), "telemetry row: answer 'ecko': must be echo, reply or row:NAME"),
     ("echo on a line that has none", '[link.serial]\nframing = { kind = "cubespace" }\n' + telecommand("", more='answer = ["echo", "reply"]'), "telecommand command: answer 'echo': link.serial with framing cubespace has no echoes"),
-    ("echo on CAN", '[link.can]\nkind = "cubespace"\n' + telemetry("", more='answer = ["echo", "reply"]'), "telemetry row: answer 'echo': link.can has no echoes"),
+    ("echo on CAN", '[link.can]\nkind = "cubespace"\n' + telemetry("", more='answer = ["echo", "reply"]').replace("id = 1\n", "id = 200\n"), "telemetry row: answer 'echo': link.can has no echoes"),
     ("unknown key", telemetry('{ name = "a", type = "u8", scal = 2 }'), r"row\.fields\.a\.scal: unknown key; did you mean scale"),
     ("unknown key of a check", '[link.serial]\nframing = { kind = "slip" }\ncheck = { kind = "sum", colour = 1 }\n' + telemetry(""), r"link\.serial\.check\.colour: unknown key"),
     ("unknown key of a framing", '[link.serial]\nframing = { kind = "fixed", colour = 1 }\n' + telemetry(""), r"link\.serial\.framing\.colour: unknown key"),

@@ -69,7 +69,7 @@ def request(pipeline: Pipeline, profile: Profile, index: int) -> FrameRequest:
     icd = load_unit()
     parameters = Parameters(icd, profile_defaults(profile, icd))
     parameters.adopt_defaults(camera_constants(pipeline.camera.to_dict()))
-    settings = SolverSettings(**{name: parameters[name] for name in SolverSettings.__dataclass_fields__})
+    settings = SolverSettings.of(parameters)
     return FrameRequest(index, NOWHERE, 0.5, 1.0, settings=settings)
 
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.sensor.pipeline.messages import FrameRequest, PipelineSetup
+from starhil.emulator.profile import Profile
+from starhil.emulator.profile.pipeline_setup import pipeline_setup
+from starhil.emulator.sensor.pipeline.messages import FrameRequest
 from starhil.emulator.sensor.pipeline.pipeline import Pipeline
 from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
@@ -147,14 +149,12 @@ def test_an_option_that_the_algorithm_does_not_have_is_named(algorithm, option, 
 
 
 def test_frames_are_solved_while_another_index_is_built_and_then_the_new_limit_holds():
-    setup = PipelineSetup(
-        camera={"fov_deg": 42.0}, sensor={}, sky={}, identifier={"cache": False}, catalog_path="", epoch=2026.0,
-        algorithm="geometric", seed=1, build_in_background=True,
-    )  # fmt: skip
+    profile = Profile.model_validate({"identifier": {"cache": False}, "catalog": {"epoch": 2026.0}})
+    setup = replace(pipeline_setup(profile), build_in_background=True)
     pipeline = Pipeline(setup)
     magnitude = dict(zip(pipeline.catalog.hip.tolist(), pipeline.catalog.v.tolist(), strict=True))
     truth = Attitude.from_radec_roll(83.8, -1.2, 0.0)
-    asked = FrameRequest(0, TruthState(truth, ZERO_RATE), 0.1, 1.0)
+    asked = FrameRequest(0, TruthState(truth, ZERO_RATE), 0.1, 1.0, setup.settings)
     bright = replace(asked, settings=replace(asked.settings, limiting_magnitude=4.0))
 
     def solve(request):

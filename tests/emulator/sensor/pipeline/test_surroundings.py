@@ -20,7 +20,7 @@ from starid.catalog import load_catalog
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 BETELGEUSE = 27989
-REQUEST = FrameRequest(0, TruthState(ORION, ZERO_RATE), 0.1, 1.0)
+REQUEST = FrameRequest(0, TruthState(ORION, ZERO_RATE), 0.1, 1.0, pipeline_setup(Profile()).settings)
 SIGN_BIT, EXPONENT_BIT = 31, 30
 
 

@@ -1,0 +1,68 @@
+"""Recent attitudes of a sensor: its body rate, and the attitude that follows from it."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from starid.attitude import Attitude, propagate
+
+RATE_SPAN_S: Final = 2.0
+"""Age up to which attitudes are used for the rate, seconds; the last two are always used."""
+
+
+class AttitudeHistory:
+    """The last `window` valid attitudes, on any monotonic clock, which counts `per_second` (nanoseconds: 10⁹)."""
+
+    def __init__(self, window: int, per_second: float = 1.0) -> None:
+        self._per_second = per_second
+        self._fixes: deque[tuple[float, Attitude]] = deque(maxlen=window)
+        self._interrupted = False
+
+    def interrupt(self) -> None:
+        """End the history with the last attitude: the rate between it and the next one is not that of the motion."""
+        self._interrupted = True
+
+    def clear(self) -> None:
+        """Discard all attitudes."""
+        self._fixes.clear()
+        self._interrupted = False
+
+    @property
+    def last(self) -> tuple[float, Attitude] | None:
+        """Time and value of the last attitude, or None."""
+        return self._fixes[-1] if self._fixes else None
+
+    def add(self, at: float, attitude: Attitude, longest_gap_s: float) -> None:
+        """Add an attitude; older ones are discarded after an interruption, after a longer gap, or if time has not passed."""
+        follows = self._fixes and 0 < at - self._fixes[-1][0] <= longest_gap_s * self._per_second
+        if self._interrupted or not follows:
+            self._fixes.clear()
+        self._interrupted = False
+        self._fixes.append((at, attitude))
+
+    def rate(self) -> tuple[float, float, float] | None:
+        """Return the least-squares body rate over the attitudes, sensor frame, rad/s; None for fewer than two."""
+        if len(self._fixes) < 2:
+            return None
+        latest, newest = self._fixes[-1]
+        recent = [
+            (time, attitude)
+            for n, (time, attitude) in enumerate(reversed(self._fixes))
+            if n < 2 or latest - time <= RATE_SPAN_S * self._per_second
+        ]
+        times = np.array([(time - latest) / self._per_second for time, _ in recent])
+        turns = np.array([attitude.error_to(newest).rotation_vector_rad for _, attitude in recent])
+        times -= times.mean()
+        x, y, z = (times @ turns / (times @ times)).tolist()
+        return (x, y, z)
+
+    def predict(self, at: float, rate_rad_s: ArrayLike | None) -> Attitude | None:
+        """Return the attitude at a later time, with a body rate since the last one; without a rate, the last one."""
+        if not self._fixes:
+            return None
+        since, last = self._fixes[-1]
+        return last if rate_rad_s is None else propagate(last, rate_rad_s, (at - since) / self._per_second)
