@@ -13,7 +13,7 @@ import socket
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Hashable, Sequence
-from typing import Final, cast
+from typing import ClassVar, Final, cast
 
 log: Final = logging.getLogger("starhil.connections")
 
@@ -74,13 +74,14 @@ class ConnectionLimit:
 
 
 class TurnProtocol(asyncio.BufferedProtocol):
-    """A connection that reads at most `TURN` bytes before the loop serves other connections."""
+    """A connection that reads at most `read_size` bytes before the loop serves other connections."""
 
+    read_size: ClassVar[int] = TURN
     _buffer: bytearray
 
     def get_buffer(self, sizehint: int) -> bytearray:  # noqa: ARG002 (asyncio's signature)
         """Return the buffer for the next bytes."""
-        self._buffer = bytearray(TURN)
+        self._buffer = bytearray(self.read_size)
         return self._buffer
 
     def buffer_updated(self, nbytes: int) -> None:

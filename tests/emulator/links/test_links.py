@@ -1,7 +1,13 @@
 """The device on serial and CAN at once, over transports that only pass on what they are given."""
 
 import asyncio
+import contextlib
+import os
 import random
+import socket
+import tty
+from itertools import pairwise
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -16,6 +22,7 @@ from starhil.protocol.can.cubespace import CanHostReceiver, CanId, MessageType, 
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.transports.serial import open_serial
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
 from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
@@ -346,6 +353,38 @@ def test_an_incomplete_message_is_abandoned_and_counted(bench, monkeypatch):
         assert bench.icd.telemetry["communication_status"].decode(reply.data)["uart_incomplete"]
         await linked.serial.close()
         await linked.can.close()
+
+    in_loop(scenario())
+
+
+@pytest.mark.parametrize("kind", ["pty", "tty", "listen"])
+def test_a_flood_on_the_serial_line_leaves_the_loop_to_others_after_some_80_faults(bench, kind):
+    """Of 64 kB, 1 365 faults were counted at once, and replies on CAN waited several times as long."""
+
+    async def scenario():
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        spec = {"pty": "pty", "tty": os.ttyname(slave), "listen": "listen://127.0.0.1:0"}[kind]
+        link = SerialLink(bench.requests, open_serial(spec, 921_600))
+        port = await link.start()
+        counts = [0]
+        with contextlib.ExitStack() as stack:
+            stack.callback(os.close, slave)
+            stack.callback(os.close, master)
+            peer = master
+            if kind == "pty":
+                peer = os.open(port, os.O_WRONLY | os.O_NOCTTY)
+                stack.callback(os.close, peer)
+            elif kind == "listen":
+                address = urlsplit(port)
+                peer = stack.enter_context(socket.create_connection((address.hostname, address.port))).fileno()
+            written = os.write(peer, b"\x1f\x7f\x80" * 1300)
+            async with asyncio.timeout(10.0):
+                while counts[-1] < written // 3 - 1:
+                    await asyncio.sleep(0)
+                    counts.append(sum(bench.device.counters.faults.values()))
+            await link.close()
+        assert max(after - before for before, after in pairwise(counts)) <= 86
 
     in_loop(scenario())
 
