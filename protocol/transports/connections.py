@@ -18,8 +18,7 @@ from typing import ClassVar, Final, cast
 log: Final = logging.getLogger("starhil.connections")
 
 TURN: Final = 4 * 1024
-"""Maximum number of bytes that a connection reads per turn of the loop: about 100 CAN frames as text, or 10
-ms of work for a device."""
+"""Maximum number of bytes that a connection of a server reads per turn of the loop: about 100 CAN frames as text."""
 
 WINDOW: Final = 16 * 1024
 """Size of each buffer of a connection, bytes; buffered bytes delay later ones."""

@@ -377,7 +377,9 @@ def test_a_flood_on_the_serial_line_leaves_the_loop_to_others_after_some_80_faul
                 stack.callback(os.close, peer)
             elif kind == "listen":
                 address = urlsplit(port)
-                peer = stack.enter_context(socket.create_connection((address.hostname, address.port))).fileno()
+                peer = stack.enter_context(
+                    socket.create_connection((address.hostname, address.port))
+                ).fileno()
             written = os.write(peer, b"\x1f\x7f\x80" * 1300)
             async with asyncio.timeout(10.0):
                 while counts[-1] < written // 3 - 1:
