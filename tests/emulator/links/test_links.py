@@ -167,6 +167,24 @@ def test_the_answer_to_a_change_of_the_bit_rate_goes_out_at_the_old_one(bench):
     in_loop(scenario())
 
 
+def test_a_change_of_rate_and_dialect_waits_for_a_pending_answer(bench):
+    """The answer went out in the old dialect, but at the rate that another link had set meanwhile."""
+
+    async def scenario():
+        linked = await Linked(bench, "b").start()
+        waiting = []
+        bench.device._background = lambda _work, done: waiting.append(done)
+        linked.over_serial(bench.icd.telecommands["save_parameters"].id)
+        bench.device.parameters.set({"serial_baud": 57600, "serial_dialect": "a"})
+        await asyncio.sleep(0)
+        assert linked.uart.take() == []
+        waiting.pop()(None)
+        assert linked.uart.take() == [b"\x1f\x7f\x00\x1f\xff", 57600]
+        assert linked.serial.dialect == "a"
+
+    in_loop(scenario())
+
+
 def test_the_answer_to_a_change_of_dialect_goes_out_in_the_old_one(bench):
     async def scenario():
         linked = await Linked(bench, "b").start()
