@@ -49,9 +49,8 @@ class Linked:
     def over_serial(self, identifier, data=b"", dialect=None) -> list[Reply | LinkFault]:
         request = Request.of(identifier, data)
         host = CUBESTAR.host(Dialect(dialect or self.bench.device.parameters["serial_dialect"]))
-        host.expect(request)
         self.uart.take()
-        self.uart.arrive(CUBESPACE.encode_request(request))
+        self.uart.arrive(host.request(request))
         return host.feed(b"".join(self.uart.take()), 0.0)
 
     def over_can(self, identifier, data=b"", source=1, destination=4) -> list[Reply | LinkFault]:
