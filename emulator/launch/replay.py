@@ -42,8 +42,9 @@ from starhil.emulator.sensor.pipeline.client import (
 )
 from starhil.emulator.sensor.pipeline.messages import PipelineEnded, PipelineReady
 from starhil.emulator.simulation.clock import NANOSECONDS, SteppedClock
+from starhil.emulator.simulation.config_model import Strict
 from starhil.emulator.simulation.guard import call_guarded
-from starhil.emulator.truth.config import Strict, TruthConfig
+from starhil.emulator.truth.config import TruthConfig
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import Transport

@@ -20,7 +20,7 @@ from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
-from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
+from tests.protocol.serial.composed_links import CUBESTAR
 
 pytestmark = pytest.mark.process
 
