@@ -7,6 +7,7 @@ import contextlib
 import json
 import logging
 import secrets
+import socket
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, cast
@@ -17,11 +18,12 @@ from aiohttp.http import HttpProcessingError
 
 from starhil.emulator.console.console import Console
 from starhil.emulator.console.viewer import Viewer
+from starhil.emulator.control.channel import REQUEST_S
 from starhil.emulator.control.token import is_token
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.json_lines import JsonError, parse_object
 from starhil.protocol.errors import reason
-from starhil.protocol.transports.connections import REQUEST_S, ConnectionLimit, limit_unsent
+from starhil.protocol.transports.connections import WINDOW, ConnectionLimit
 
 log = logging.getLogger("starhil.console")
 
@@ -211,7 +213,7 @@ class ConsoleServer:
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE, compress=False)
         await socket.prepare(request)
         if request.transport is not None:
-            limit_unsent(request.transport)
+            _limit_unsent(request.transport)
         viewer = Viewer(socket, commands=self._has_token(request, self.token))
         tasks: set[asyncio.Task[None]] = set()
         try:
@@ -339,3 +341,10 @@ def parse_address(where: str) -> tuple[str, int]:
     if not host or not port.isdecimal() or int(port) > 65535:
         raise EmulatorError(f"--view {where}: must be auto or HOST:PORT")
     return host.strip("[]"), int(port)
+
+
+def _limit_unsent(transport: asyncio.BaseTransport) -> None:
+    """Limit what a TCP connection buffers before it is sent, without a limit of what is under way."""
+    cast("asyncio.WriteTransport", transport).set_write_buffer_limits(WINDOW)
+    connection = transport.get_extra_info("socket")
+    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, WINDOW)

@@ -43,7 +43,7 @@ from starhil.emulator.truth.live import LiveTruth
 from starhil.protocol.errors import ProtocolError, did_you_mean, remedy
 from starhil.protocol.files.validation import problems
 from starhil.protocol.icd.conventions import NANOSECONDS
-from starhil.protocol.transports.connections import REQUEST_S, ConnectionLimit
+from starhil.protocol.transports.connections import ConnectionLimit
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
@@ -56,6 +56,10 @@ EXAMINED: Final = 200
 
 KEPT_FRAMES: Final = 200
 BUSY: Final = b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
+
+REQUEST_S: Final = 10.0
+"""Time within which a peer of the control channel or of the console must complete a request: a line, after its first
+byte; for HTTP, after it has connected or received the last response, and the body after the headers; seconds."""
 
 LATE: Final = json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
 

@@ -28,8 +28,9 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile.toml_file import find_toml, read_toml
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.run.head import Head
+from starhil.emulator.simulation.config_model import Strict
 from starhil.emulator.simulation.scheduler import Action
-from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
+from starhil.emulator.truth.config import FeedConfig, TruthConfig
 from starhil.emulator.truth.truth import Truth
 from starhil.protocol.errors import did_you_mean
 from starhil.protocol.files.validation import problems

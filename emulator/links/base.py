@@ -7,6 +7,7 @@ import logging
 from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from functools import partial
 from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar
 
@@ -92,8 +93,53 @@ AnyLink: TypeAlias = Link[Any]
 """An open link of any kind."""
 
 
+class Phase(Enum):
+    """What a link does while it answers a request."""
+
+    EXECUTING = "the device executes the request; further input and unsolicited messages wait"
+    PENDING = "the answer takes time; further input waits, unsolicited messages do not"
+    OVER = "everything is answered; nothing waits"
+
+
+class Turn(Enum):
+    """What ends a phase."""
+
+    ANSWERED = "the answer has been sent"
+    DELAYED = "the device answers later"
+    RESTARTED = "the device has restarted"
+
+
+NEXT_PHASE: Final = {
+    (Phase.EXECUTING, Turn.DELAYED): Phase.PENDING,
+    (Phase.EXECUTING, Turn.ANSWERED): Phase.OVER,
+    (Phase.EXECUTING, Turn.RESTARTED): Phase.EXECUTING,  # by this request, which is answered
+    (Phase.PENDING, Turn.ANSWERED): Phase.OVER,
+    (Phase.PENDING, Turn.RESTARTED): Phase.OVER,
+    (Phase.OVER, Turn.ANSWERED): Phase.OVER,  # late, after a restart
+    (Phase.OVER, Turn.RESTARTED): Phase.OVER,
+}
+
+
+@dataclass(eq=False)
+class Exchange(Generic[Style]):
+    """A request and its answer."""
+
+    style: Style
+    """Format of the answer: that in which the request found the link."""
+    phase: Phase = Phase.EXECUTING
+    caused: list[Reply] = field(default_factory=list)
+    """Unsolicited messages that the request has caused; they follow its answer."""
+
+    def advance(self, turn: Turn) -> None:
+        """Begin the phase that follows a turn."""
+        self.phase = NEXT_PHASE[self.phase, turn]
+
+
 class RequestLink(Link[Item], Generic[Item, Style]):
-    """Passes requests from a transport to the device, and replies back, in order."""
+    """Passes requests from a transport to the device, and replies back, in order.
+
+    A change of dialect, bit rate or address takes effect between two exchanges, so that it is answered in the old style.
+    """
 
     _timeout_s: float = DEFAULT_TIMEOUT_S
     """Silence after which the receiver abandons an incomplete message."""
@@ -102,24 +148,28 @@ class RequestLink(Link[Item], Generic[Item, Style]):
         self, requests: Requests, transport: Transport[Item], damage: Damage[Item], seed: int
     ) -> None:
         super().__init__(requests, transport, damage, seed)
-        self._loop = asyncio.get_running_loop()
+        self._style = self._wanted_style()
+        """The style of what is sent: dialect and bit rate, or source address."""
+        self._exchange = Exchange(self._style, Phase.OVER)
+        """The latest exchange."""
         self._receiver = self._new_receiver()
         self._held_input: deque[Request | LinkFault] = deque()
-        """Input that arrived while a reply is pending, because replies are sent in the order of requests."""
-        self._pending: PendingAnswer[list[Reply]] | None = None
-        self._executing = False
-        self._caused: list[Reply] = []
-        """Unsolicited messages that the request being executed has caused so far; they follow its replies."""
+        """Input that arrived during the exchange, because replies are sent in the order of requests."""
         self._device.signals.unsolicited.connect(self._send_unsolicited)
-        self._device.signals.restarted.connect(self._reset_receiver)
+        self._device.signals.restarted.connect(self._device_restarted)
+        self._device.signals.parameters_changed.connect(self._adopt_style)
 
     @abstractmethod
     def _new_receiver(self) -> Receiver[Item, Request]:
         """Return a new receiver for the framing."""
 
     @abstractmethod
-    def _reply_style(self) -> Style:
-        """Return the current format of replies: dialect or source address."""
+    def _wanted_style(self) -> Style:
+        """Return the style that the parameters demand."""
+
+    @abstractmethod
+    def _style_changed(self, before: Style) -> None:
+        """Let port and receiver follow the style."""
 
     @abstractmethod
     def _send(self, reply: Reply, style: Style) -> None:
@@ -129,12 +179,19 @@ class RequestLink(Link[Item], Generic[Item, Style]):
     def _is_console(self, request: Request) -> bool:
         """Return whether console or recording sent a request."""
 
+    def _adopt_style(self, _cause: object = None) -> None:
+        """Follow the parameters, unless an exchange has to end first."""
+        if self._exchange.phase is Phase.OVER:
+            before, self._style = self._style, self._wanted_style()
+            if self._style != before:
+                self._style_changed(before)
+
     def _send_unsolicited(self, reply: Reply) -> None:
         """Send unsolicited telemetry."""
-        if self._executing:
-            self._caused.append(reply)
+        if self._exchange.phase is Phase.EXECUTING:
+            self._exchange.caused.append(reply)
         else:
-            self._send(reply, self._reply_style())
+            self._send(reply, self._style)
 
     def _receive(self, item: Item) -> None:
         self._held_input.extend(self._receiver.feed(item, self._now()))
@@ -142,42 +199,39 @@ class RequestLink(Link[Item], Generic[Item, Style]):
         self._schedule_flush()
 
     def _dispatch_waiting(self) -> None:
-        while self._held_input and self._pending is None:
+        while self._held_input and self._exchange.phase is Phase.OVER:
             self._dispatch(self._held_input.popleft())
 
     def _dispatch(self, event: Request | LinkFault) -> None:
         if isinstance(event, LinkFault):
             self._requests.count_fault(event)
             return
-        style = self._reply_style()  # a change of format is answered in the old format
+        exchange = self._exchange = Exchange(self._style)
         console = self._is_console(event)
         if not console:
             self.heard.count()
-        self._executing = True
         try:
             answer = self._requests.handle(event, console=console)
-        finally:
-            self._executing = False
-        caused, self._caused = self._caused, []
+        except BaseException:
+            exchange.advance(Turn.ANSWERED)
+            raise
         if isinstance(answer, PendingAnswer):
-            self._pending = answer
-            answer.when_done(partial(self._answer_later, answer, caused, style))
+            exchange.advance(Turn.DELAYED)
+            answer.when_done(partial(self._answer_later, exchange))
         else:
-            self._answer(answer, caused, style)
+            self._answer(exchange, answer)
 
-    def _answer_later(
-        self, answer: PendingAnswer[list[Reply]], caused: list[Reply], style: Style, replies: list[Reply]
-    ) -> None:
-        self._answer(replies, caused, style)
-        if self._pending is answer:
-            self._pending = None
-            self._dispatch_waiting()
+    def _answer_later(self, exchange: Exchange[Style], replies: list[Reply]) -> None:
+        self._answer(exchange, replies)
+        self._dispatch_waiting()
 
-    def _answer(self, replies: list[Reply], caused: list[Reply], style: Style) -> None:
+    def _answer(self, exchange: Exchange[Style], replies: list[Reply]) -> None:
         """Send the replies to a request, and then the unsolicited messages that it has caused."""
         for reply in replies:
-            self._send_reply(reply, style)
-        for reply in caused:
+            self._send_reply(reply, exchange.style)
+        exchange.advance(Turn.ANSWERED)
+        self._adopt_style()
+        for reply in exchange.caused:
             self._send_unsolicited(reply)
 
     def _send_reply(self, reply: Reply, style: Style) -> None:
@@ -200,8 +254,9 @@ class RequestLink(Link[Item], Generic[Item, Style]):
             self._requests.count_fault(fault)
         self._schedule_flush()
 
-    def _reset_receiver(self, _cause: str) -> None:
-        """Discard incomplete and pending input, because the device has restarted."""
+    def _device_restarted(self, _cause: str) -> None:
+        """Discard incomplete and waiting input, and await no answer from before."""
         self._receiver = self._new_receiver()
         self._held_input.clear()
-        self._pending = None
+        self._exchange.advance(Turn.RESTARTED)
+        self._adopt_style()

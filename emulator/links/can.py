@@ -63,12 +63,11 @@ class CanLink(RequestLink[CanFrame, int]):
         self._waiting: deque[CanFrame] = deque()
         self._next: asyncio.TimerHandle | None = None
         self._address = BusAddress("address", "links.can.address")
-        self._device.signals.parameters_changed.connect(self._parameters_changed)
 
     async def start(self) -> str:
         """Join the bus; return its description."""
         bus = await super().start()
-        self._address.acquire(bus, self._reply_style())
+        self._address.acquire(bus, self._style)
         return bus
 
     async def close(self) -> None:
@@ -87,10 +86,14 @@ class CanLink(RequestLink[CanFrame, int]):
         return request.source == CONSOLE_ADDRESS
 
     def _new_receiver(self) -> CanDeviceReceiver:
-        return CanDeviceReceiver(self._reply_style())
+        return CanDeviceReceiver(self._style)
 
-    def _reply_style(self) -> int:
+    def _wanted_style(self) -> int:
         return int(self._device.parameters["can_address"])
+
+    def _style_changed(self, before: int) -> None:  # noqa: ARG002 (the interface's signature)
+        self._receiver = self._new_receiver()
+        self._address.change(self.transport.description, self._style)
 
     def _send(self, reply: Reply, style: int) -> None:
         for frame in encode_reply_frames(reply, style):
@@ -108,9 +111,4 @@ class CanLink(RequestLink[CanFrame, int]):
         self._next = None
         if self._waiting:
             super()._transmit(self._waiting.popleft())
-            self._next = self._loop.call_later(self._gap_s, self._transmit_next)
-
-    def _parameters_changed(self, names: frozenset[str]) -> None:
-        if "can_address" in names:
-            self._receiver = self._new_receiver()
-            self._address.change(self.transport.description, self._reply_style())
+            self._next = asyncio.get_running_loop().call_later(self._gap_s, self._transmit_next)

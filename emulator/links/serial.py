@@ -5,11 +5,11 @@ from __future__ import annotations
 import random
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple
 
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import RequestLink
-from starhil.protocol.messages import Receiver, Reply, Request
+from starhil.protocol.messages import Receiver, Reply, ReplyKind, Request
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.serial.stack import SerialStack
 from starhil.protocol.transports.paced import SerialTransport
@@ -35,7 +35,15 @@ class SerialDamage:
         return [item[start : start + size] for start in range(0, len(item), size)]
 
 
-class SerialLink(RequestLink[bytes, Dialect | None]):
+class SerialStyle(NamedTuple):
+    """How a serial line is used."""
+
+    dialect: Dialect | None
+    """Dialect of replies; None for a unit without dialects."""
+    baud: int
+
+
+class SerialLink(RequestLink[bytes, SerialStyle]):
     """Connects a device to a serial transport, at the bit rate in its parameter `serial_baud`.
 
     The CubeSpace family has three dialects of replies, of which only c has unsolicited telemetry.
@@ -54,28 +62,14 @@ class SerialLink(RequestLink[bytes, Dialect | None]):
         self._console = console
         self._stack = SerialStack(requests.device.icd)
         self._timeout_s = self._stack.link.timeout
-        super().__init__(requests, transport, SerialDamage(), seed)
         self._port = transport
-        self._baud = self._wanted_baud()
+        super().__init__(requests, transport, SerialDamage(), seed)
         self._numbered = 0
         """Messages that the device has numbered since its start."""
         self._device.signals.started.connect(self._restart_numbers, first=True)
-        self._device.signals.parameters_changed.connect(self._parameters_changed)
 
     def _restart_numbers(self, _cause: str) -> None:
         self._numbered = 0
-
-    def _wanted_baud(self) -> int:
-        return int(self._device.parameters["serial_baud"])
-
-    def _parameters_changed(self, names: frozenset[str]) -> None:
-        if "serial_baud" in names:  # the change is acknowledged at the old rate
-            self._loop.call_soon(self._change_rate)
-
-    def _change_rate(self) -> None:
-        if self._baud != self._wanted_baud():
-            self._baud = self._wanted_baud()
-            self._port.set_baud(self._baud)
 
     def _is_console(self, request: Request) -> bool:  # noqa: ARG002 (nobody else is on its line)
         return self._console
@@ -85,23 +79,27 @@ class SerialLink(RequestLink[bytes, Dialect | None]):
 
     @property
     def dialect(self) -> Dialect | None:
-        """The current dialect of replies; None for a unit without dialects."""
-        if len(self._stack.dialects) < 2:
-            return next(iter(self._stack.dialects), None)
-        return Dialect(str(self._device.parameters["serial_dialect"]))
+        """The dialect of replies; None for a unit without dialects."""
+        return self._style.dialect
 
-    def _reply_style(self) -> Dialect | None:
-        return self.dialect
+    def _wanted_style(self) -> SerialStyle:
+        parameters, dialects = self._device.parameters, self._stack.dialects
+        dialect = next(iter(dialects), None)
+        if len(dialects) > 1:
+            dialect = Dialect(str(parameters["serial_dialect"]))
+        return SerialStyle(dialect, int(parameters["serial_baud"]))
 
-    def _send(self, reply: Reply, style: Dialect | None) -> None:
+    def _style_changed(self, before: SerialStyle) -> None:
+        if self._style.baud != before.baud:
+            self._port.set_baud(self._style.baud)
+
+    def _send(self, reply: Reply, style: SerialStyle) -> None:
+        if reply.kind is ReplyKind.UNSOLICITED and not self._stack.supports_unsolicited(style.dialect):
+            return
         numbered = self._stack.counts(reply.kind)
         if numbered:
             reply = replace(reply, sequence=self._numbered)
-        data = self._stack.encode_reply(reply, style)
+        data = self._stack.encode_reply(reply, style.dialect)
         if data:  # the unit may have no such reply
             self._numbered += numbered
             self.wire.send(data)
-
-    def _send_unsolicited(self, reply: Reply) -> None:
-        if self._stack.supports_unsolicited(self.dialect):
-            super()._send_unsolicited(reply)

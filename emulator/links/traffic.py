@@ -126,7 +126,7 @@ class Decoder:
         requests = self._to_device.feed(data, now)
         for event in requests:
             if isinstance(event, Request):
-                host.expect(event)
+                host.overhear(event)
         return requests
 
     def _can_events(self, frame: CanFrame, now: float) -> Sequence[Request | Reply | LinkFault]:

@@ -10,8 +10,8 @@ from typing import Annotated, Generic, Protocol, TypeVar
 from pydantic import Field
 
 from starhil.emulator.simulation.clock import Clock
+from starhil.emulator.simulation.config_model import Strict
 from starhil.emulator.simulation.scheduler import Scheduler
-from starhil.emulator.truth.config import Strict
 from starhil.protocol.icd.conventions import NANOSECONDS
 
 Item = TypeVar("Item")

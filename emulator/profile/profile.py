@@ -34,14 +34,8 @@ from starhil.emulator.profile.sections import (
     TimingConfig,
 )
 from starhil.emulator.profile.toml_file import find_toml, read_toml
-from starhil.emulator.truth.config import (
-    FixedConfig,
-    OrbitConfig,
-    Strict,
-    TruthConfig,
-    UserPath,
-    profile_paths,
-)
+from starhil.emulator.simulation.config_model import Strict, UserPath
+from starhil.emulator.truth.config import FixedConfig, OrbitConfig, TruthConfig, profile_paths
 from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError, remedy
 from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled_units, find, not_found
 from starhil.protocol.files.user_file import TomlError, parse_toml

@@ -9,7 +9,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from starhil.emulator.truth.config import Date, InProfileFolder, Strict, UserPath, profile_paths
+from starhil.emulator.simulation.config_model import Date, Strict, UserPath
+from starhil.emulator.truth.config import InProfileFolder, profile_paths
 
 FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
 """Duration of one stage of a frame, seconds."""

@@ -14,7 +14,7 @@ from starhil.emulator.links.base import AnyLink
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.sensor.pipeline.messages import DIRECTION_BITS, CatalogUpset
 from starhil.emulator.sensor.sky.objects import SkyObjects
-from starhil.emulator.truth.config import Strict
+from starhil.emulator.simulation.config_model import Strict
 from starhil.protocol.errors import did_you_mean, remedy
 
 

@@ -1,1 +1,1 @@
-"""Time and events, and what may fail without ending a run."""
+"""Time and events, what may fail without ending a run, and the base of configuration models."""

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self, TypeAlias, get_args, get_origin
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import BaseModel, Field, model_validator
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.simulation.config_model import Date, Strict, UserPath
 from starhil.emulator.truth.feed import Socket
 from starhil.emulator.truth.feed_message import JsonFormat
 from starhil.emulator.truth.file import read_orbit_file, read_truth_file
@@ -32,7 +33,6 @@ from starhil.emulator.truth.source import (
     TruthSource,
 )
 from starid.attitude import Attitude
-from starid.catalog.earth import LATEST_UNIX_S, unix_time
 
 AxisRate: TypeAlias = Annotated[float, Field(ge=-MAX_RATE_DEG_S, le=MAX_RATE_DEG_S)]
 Rate: TypeAlias = Annotated[list[AxisRate], Field(min_length=3, max_length=3)]
@@ -42,21 +42,6 @@ Turn: TypeAlias = Annotated[float, Field(ge=-360.0, le=360.0)]
 """Right ascension or roll, degrees."""
 
 SegmentSeconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1e9)]
-
-Date: TypeAlias = Annotated[float, Field(ge=0.0, le=LATEST_UNIX_S), BeforeValidator(unix_time)]
-"""A date in UTC, stored as Unix time."""
-
-
-def _expanded(path: str) -> str:
-    """Return a path with the home folder in place of `~`; ValueError if the user has none."""
-    try:
-        return str(Path(path).expanduser()) if path.startswith("~") else path
-    except RuntimeError:
-        raise ValueError(f"{path.partition('/')[0]} has no home folder; give another path") from None
-
-
-UserPath: TypeAlias = Annotated[str, AfterValidator(_expanded)]
-"""A path as a user writes it, which may begin with `~`; expanded when it is read."""
 
 
 @dataclass(frozen=True)
@@ -86,12 +71,6 @@ def _tables_in(annotation: Any) -> Iterator[type[BaseModel]]:
     elif get_origin(annotation) is not list:
         for part in get_args(annotation):
             yield from _tables_in(part)
-
-
-class Strict(BaseModel):
-    """Base of configuration models: rejects unknown keys, numbers in quotes and non-finite numbers."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
 
 
 class AttitudeConfig(Strict):

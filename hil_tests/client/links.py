@@ -155,8 +155,7 @@ class SerialHostLink(HostLink[bytes]):
 
     def request(self, request: Request) -> None:
         """Frame and send a request."""
-        self._receiver.expect(request)
-        self.send(self._stack.encode_request(request))
+        self.send(self._receiver.request(request))
 
     def marks_unsolicited(self, klass: str) -> bool:
         """Return whether unsolicited telemetry of a class says that it is."""

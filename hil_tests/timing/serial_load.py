@@ -62,7 +62,7 @@ class _SerialPipeline:
         """Record a request as active and return it as bytes."""
         self._under_way.append((request, size))
         if len(self._under_way) == 1:
-            self._receiver.expect(request)
+            return self._receiver.request(request)
         return self._stack.encode_request(request)
 
     def take(self, data: bytes) -> None:
@@ -92,7 +92,7 @@ class _SerialPipeline:
         self.exchanges += 1
         self.last = event.data
         if self._under_way:
-            self._receiver.expect(self._under_way[0][0])
+            self._receiver.overhear(self._under_way[0][0])
 
 
 async def load_serial(

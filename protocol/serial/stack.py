@@ -345,8 +345,8 @@ class SerialStack:
 class HostReceiver:
     """The OBC's end: bytes in, replies and faults out.
 
-    Call `expect` before each request: some units' replies can be interpreted only with it. An echo of the request is
-    verified and consumed. For a telecommand without another answer it is reported as the ACK.
+    Requests are made by `request`, since some units' replies can be interpreted only with their request. An echo of the
+    request is verified and consumed. For a telecommand without another answer it is reported as the ACK.
     """
 
     def __init__(self, stack: SerialStack, in_dialect: DialectReplies | None) -> None:
@@ -379,8 +379,17 @@ class HostReceiver:
         """Abandon an incomplete message after a silence of the timeout."""
         return self._deframer.flush(now)
 
-    def expect(self, request: Request) -> None:
-        """Set the next request."""
+    def request(self, request: Request) -> bytes:
+        """Return a request as bytes on the line; what arrives next is read as its answer.
+
+        Raises ProtocolError as `SerialStack.encode_request`.
+        """
+        line = self._stack.encode_request(request)
+        self.overhear(request)
+        return line
+
+    def overhear(self, request: Request) -> None:
+        """Read what arrives next as the answer to a request that has been sent by another, or earlier."""
         row = self._stack.icd.row(request.id, request.klass)
         answers = self._stack.answers(row) if row is not None else ("reply",)
         self._pending = request

@@ -1,6 +1,6 @@
 """Fair sharing of an event loop by many connections, a limit of their number, and socket options for TCP.
 
-Each connection reads a limited amount per turn of the loop, and no sender waits for the backlog of another.
+Each connection reads a limited amount per turn of the loop.
 A server without a limit would take every file descriptor of the process, and links could not be reopened.
 """
 
@@ -11,15 +11,12 @@ import logging
 import resource
 import socket
 from abc import abstractmethod
-from collections import deque
-from collections.abc import Hashable, Sequence
-from typing import Final, cast
+from typing import ClassVar, Final, cast
 
 log: Final = logging.getLogger("starhil.connections")
 
 TURN: Final = 4 * 1024
-"""Maximum number of bytes that a connection reads per turn of the loop: about 100 CAN frames as text, or 10
-ms of work for a device."""
+"""Maximum number of bytes that a connection of a server reads per turn of the loop: about 100 CAN frames as text."""
 
 WINDOW: Final = 16 * 1024
 """Size of each buffer of a connection, bytes; buffered bytes delay later ones."""
@@ -34,10 +31,6 @@ UNREAD_LIMIT_MS: Final = 10_000
 
 MAX_CONNECTIONS: Final = 64
 """Maximum number of connections of a server."""
-
-REQUEST_S: Final = 10.0
-"""Time within which a peer must complete a request: for HTTP, after it has connected or received the last response,
-and the body after the headers; for a line, after its first byte; seconds."""
 
 SHARE_OF_DESCRIPTORS: Final = 8
 """A server uses at most one in this many of the file descriptors that the process may open."""
@@ -74,13 +67,14 @@ class ConnectionLimit:
 
 
 class TurnProtocol(asyncio.BufferedProtocol):
-    """A connection that reads at most `TURN` bytes before the loop serves other connections."""
+    """A connection that reads at most `read_size` bytes before the loop serves other connections."""
 
+    read_size: ClassVar[int] = TURN
     _buffer: bytearray
 
     def get_buffer(self, sizehint: int) -> bytearray:  # noqa: ARG002 (asyncio's signature)
         """Return the buffer for the next bytes."""
-        self._buffer = bytearray(TURN)
+        self._buffer = bytearray(self.read_size)
         return self._buffer
 
     def buffer_updated(self, nbytes: int) -> None:
@@ -98,13 +92,6 @@ def limit_buffers(transport: asyncio.BaseTransport) -> None:
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, option, WINDOW)
 
 
-def limit_unsent(transport: asyncio.BaseTransport) -> None:
-    """Limit what a TCP connection buffers before it is sent, without a limit of what is under way."""
-    cast("asyncio.WriteTransport", transport).set_write_buffer_limits(WINDOW)
-    connection = transport.get_extra_info("socket")
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, WINDOW)
-
-
 def detect_lost_peer(transport: asyncio.BaseTransport, *, must_read: bool = False) -> None:
     """Close a silent TCP connection within about ten seconds after the other machine has disappeared.
 
@@ -116,51 +103,3 @@ def detect_lost_peer(transport: asyncio.BaseTransport, *, must_read: bool = Fals
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     for option, value in options.items():
         connection.setsockopt(socket.IPPROTO_TCP, option, value)
-
-
-class FairQueue:
-    """Queue of lines for one receiver, in which senders take turns, one line each.
-
-    Lines of one sender stay in order. When the queue is full, the sender with the most waiting bytes loses
-    its oldest line. `limit` is the maximum number of waiting bytes.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._lines: dict[Hashable, deque[bytes]] = {}
-        self._sizes: dict[Hashable, int] = {}
-        self.size = 0
-        """Number of waiting bytes."""
-
-    def put(self, sender: Hashable, lines: Sequence[bytes]) -> int:
-        """Add lines of a sender; return how many lines were dropped, of any sender."""
-        if not lines:
-            return 0
-        added = sum(map(len, lines))
-        self._lines.setdefault(sender, deque()).extend(lines)
-        self._sizes[sender] = self._sizes.get(sender, 0) + added
-        self.size += added
-        dropped = 0
-        while self.size > self._limit:
-            longest = max(self._sizes, key=lambda each: self._sizes[each])
-            self._note_removed(longest, self._lines[longest].popleft())
-            dropped += 1
-        return dropped
-
-    def take(self, size: int) -> list[bytes]:
-        """Remove and return the next lines: at least `size` bytes, or everything."""
-        taken: list[bytes] = []
-        rest = size
-        while self._lines and rest > 0:
-            for sender in tuple(self._lines):
-                line = self._lines[sender].popleft()
-                self._note_removed(sender, line)
-                taken.append(line)
-                rest -= len(line)
-        return taken
-
-    def _note_removed(self, sender: Hashable, line: bytes) -> None:
-        self.size -= len(line)
-        self._sizes[sender] -= len(line)
-        if not self._lines[sender]:
-            del self._lines[sender], self._sizes[sender]

@@ -14,7 +14,8 @@ import contextlib
 import logging
 import socket
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, TextIO, cast
@@ -25,7 +26,6 @@ from starhil.protocol.errors import ProtocolError, reason
 from starhil.protocol.transports.connections import (
     WINDOW,
     ConnectionLimit,
-    FairQueue,
     TurnProtocol,
     detect_lost_peer,
     limit_buffers,
@@ -64,6 +64,54 @@ class HubStatistics:
     """Frames dropped because a client did not read."""
     errors: int = 0
     """Malformed or unknown commands."""
+
+
+class FairQueue:
+    """Queue of lines for one receiver, in which senders take turns, one line each.
+
+    Lines of one sender stay in order. When the queue is full, the sender with the most waiting bytes loses
+    its oldest line. `limit` is the maximum number of waiting bytes.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._lines: dict[Hashable, deque[bytes]] = {}
+        self._sizes: dict[Hashable, int] = {}
+        self.size = 0
+        """Number of waiting bytes."""
+
+    def put(self, sender: Hashable, lines: Sequence[bytes]) -> int:
+        """Add lines of a sender; return how many lines were dropped, of any sender."""
+        if not lines:
+            return 0
+        added = sum(map(len, lines))
+        self._lines.setdefault(sender, deque()).extend(lines)
+        self._sizes[sender] = self._sizes.get(sender, 0) + added
+        self.size += added
+        dropped = 0
+        while self.size > self._limit:
+            longest = max(self._sizes, key=lambda each: self._sizes[each])
+            self._note_removed(longest, self._lines[longest].popleft())
+            dropped += 1
+        return dropped
+
+    def take(self, size: int) -> list[bytes]:
+        """Remove and return the next lines: at least `size` bytes, or everything."""
+        taken: list[bytes] = []
+        rest = size
+        while self._lines and rest > 0:
+            for sender in tuple(self._lines):
+                line = self._lines[sender].popleft()
+                self._note_removed(sender, line)
+                taken.append(line)
+                rest -= len(line)
+        return taken
+
+    def _note_removed(self, sender: Hashable, line: bytes) -> None:
+        self.size -= len(line)
+        self._sizes[sender] -= len(line)
+        if not self._lines[sender]:
+            del self._lines[sender], self._sizes[sender]
 
 
 class _Client(TurnProtocol):

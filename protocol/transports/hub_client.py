@@ -11,13 +11,16 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.can.socketcand import CommandError, CommandSplitter, format_send, parse_frame
 from starhil.protocol.errors import ProtocolError, reason
 from starhil.protocol.transports.base import ReconnectingTransport, TransportError
-from starhil.protocol.transports.connections import TURN, detect_lost_peer, limit_buffers
+from starhil.protocol.transports.connections import detect_lost_peer, limit_buffers
 from starhil.protocol.transports.hub import DEFAULT_BUS, CanHub
 
 _LOGGER: Final = logging.getLogger("starhil.transport")
 
 BACKLOG_LIMIT: Final = 4 * 1024 * 1024
 """Maximum number of bytes that wait for a hub that does not read."""
+
+READ_SIZE: Final = 512
+"""Maximum number of bytes that are read per turn of the loop: some 15 frames, 2 ms of work for a device."""
 
 HANDSHAKE_S: Final = 5.0
 """Longest time for the server's greeting and answers."""
@@ -92,7 +95,7 @@ class HubTransport(ReconnectingTransport[CanFrame]):
         not be sent.
         """
         splitter = CommandSplitter()
-        while data := await reader.read(TURN):
+        while data := await reader.read(READ_SIZE):
             for command in splitter.feed(data):
                 self._receive_command(command)
             await asyncio.sleep(0)  # the loop serves other connections, and the outbox is written

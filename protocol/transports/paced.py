@@ -17,6 +17,10 @@ from starhil.protocol.transports.base import Transport
 BACKLOG_LIMIT: Final = 64 * 1024
 """Maximum number of bytes that wait for the line or for a peer that does not read."""
 
+READ_SIZE: Final = 256
+"""Maximum number of bytes that a port reads per turn of the loop: 80 faults or 50 requests, some 5 ms of work for a
+device; at 921 600 baud they arrive in 3 ms."""
+
 GRAIN_S: Final = 1e-6
 """A timer may fire this much early."""
 

@@ -25,8 +25,8 @@ RETRY_S: Final = 0.001
 READ_TIMEOUT_S: Final = 0.2
 """Timeout of one read in the reader thread (for buses without a file descriptor)."""
 
-READS_PER_TURN: Final = 256
-"""Frames read per turn of the loop."""
+READS_PER_TURN: Final = 16
+"""Maximum number of frames read per turn of the loop, some 2 ms of work for a device."""
 
 SENDS_PER_TURN: Final = 64
 """Frames sent per turn of the loop."""
@@ -58,6 +58,8 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         self._echoes: deque[tuple[float, CanFrame]] | None = deque(maxlen=ECHO_LIMIT) if echoes else None
         self._bus: can.BusABC | None = None
         self._fd = -1
+        self._next_read: asyncio.Handle | None = None
+        """The next read, scheduled while frames may be waiting."""
         self._thread: threading.Thread | None = None
         self._queue: deque[CanFrame] = deque()
         self._timer: asyncio.Handle | None = None
@@ -75,7 +77,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         self._bus = bus
         self._fd = _descriptor(bus)
         if self._fd >= 0:
-            loop.add_reader(self._fd, self._readable)
+            loop.add_reader(self._fd, self._woken)
         else:
             self._thread = threading.Thread(
                 target=self._read_in_thread, args=(bus, loop), name="can-reader", daemon=True
@@ -90,7 +92,13 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
             opening.add_done_callback(_close_unused_bus)
             raise
 
+    def _woken(self) -> None:
+        if self._next_read is None:
+            self._readable()
+
     def _readable(self) -> None:
+        """Read once per turn of the loop while frames are waiting."""
+        self._next_read = None
         for _ in range(READS_PER_TURN):
             bus = self._bus
             if bus is None:
@@ -104,7 +112,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
                 return
             self._process_message(message)
         # frames that the bus object has buffered raise no event
-        asyncio.get_running_loop().call_soon(self._readable)
+        self._next_read = asyncio.get_running_loop().call_soon(self._readable)
 
     def _read_in_thread(self, bus: can.BusABC, loop: asyncio.AbstractEventLoop) -> None:
         while self._bus is bus:

@@ -15,8 +15,9 @@ import serial
 
 from starhil.protocol.errors import reason
 from starhil.protocol.transports.base import ReconnectingTransport, TransportError
-from starhil.protocol.transports.connections import TURN, TurnProtocol, detect_lost_peer
+from starhil.protocol.transports.connections import TurnProtocol, detect_lost_peer
 from starhil.protocol.transports.paced import (
+    READ_SIZE,
     PacedTransport,
     SerialTransport,
     termios_as_os_error,
@@ -112,7 +113,7 @@ class TtyTransport(PacedTransport, ReconnectingTransport[bytes]):
         if self._port is None:
             return
         try:
-            data = os.read(self._port.fileno(), TURN)
+            data = os.read(self._port.fileno(), READ_SIZE)
         except BlockingIOError:
             return
         except OSError as error:
@@ -188,6 +189,7 @@ class _TcpTransport(TurnProtocol, PacedTransport, ReconnectingTransport[bytes]):
     """A TCP connection; the protocol of its connection, of which there is one at a time."""
 
     kind = "serial"
+    read_size = READ_SIZE
     scheme: ClassVar[str]
 
     def __init__(self, host: str, port: int, pace: int | None) -> None:

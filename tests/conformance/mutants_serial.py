@@ -6,7 +6,6 @@ import dataclasses
 
 from starhil.protocol.icd.link_schema import LinkModel
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.serial.stack import SerialStack
 from tests.conformance.mutant_seams import (
     enter,
@@ -127,7 +126,7 @@ def not_taken_out(unit: SimulatedUnit) -> None:
 @mutant("unsolicited telemetry comes in a dialect that has none", "serial", "unsolicited.rate")
 def talkative(unit: SimulatedUnit) -> None:
     def say(reply: Reply) -> None:
-        unit.link._send(dataclasses.replace(reply, kind=ReplyKind.TELEMETRY), Dialect.B)
+        unit.link._send_unsolicited(dataclasses.replace(reply, kind=ReplyKind.TELEMETRY))
 
     unit.device.signals.unsolicited.observers[:] = [say]
 

@@ -109,12 +109,12 @@ def test_serial_host_receiver(dialect: Dialect) -> None:
 
     def target(number: int, data: bytes) -> None:
         if number % 2:
-            receiver.expect(REQUESTS[number % len(REQUESTS)])
+            receiver.overhear(REQUESTS[number % len(REQUESTS)])
         for event in receiver.feed(data, number * 0.01):
             assert isinstance(event, (Reply, LinkFault))
         if number % 100 == 0:
             receiver.flush(number * 0.01 + 0.5)
-            receiver.expect(expected)
+            receiver.overhear(expected)
             assert receiver.feed(CUBESPACE.encode_reply(good, dialect), number * 0.01 + 0.5)[-1] == good
 
     fuzz([CUBESPACE.encode_reply(reply, dialect) for reply in REPLIES], target)

@@ -20,7 +20,7 @@ from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
-from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
+from tests.protocol.serial.composed_links import CUBESTAR
 
 pytestmark = pytest.mark.process
 
@@ -69,8 +69,7 @@ class Emulator:
         """Send a request in dialect a; return raw bytes and the reply."""
         request = Request.of(identifier, data)
         host = CUBESTAR.host(Dialect.A)
-        host.expect(request)
-        os.write(self.fd, CUBESPACE.encode_request(request))
+        os.write(self.fd, host.request(request))
         raw, replies = b"", []
         while not replies:
             assert select.select([self.fd], [], [], REPLY_WITHIN_S)[0], "no reply"

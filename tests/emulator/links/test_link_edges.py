@@ -15,9 +15,10 @@ from starhil.emulator.simulation.scheduler import Scheduler
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.storage import ParameterStorage, StorageError
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import Request
+from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.serial.stack import SerialStack
 from tests.emulator.wire import Wire
+from tests.protocol.serial.composed_links import CUBESPACE
 
 NODE = 44
 
@@ -142,18 +143,23 @@ def test_a_stored_node_id_that_cannot_be_deleted_is_a_fault_of_the_store(node_be
     canopen_link(node_bench, test, Kept())
 
 
-def test_a_rate_that_is_set_back_before_the_acknowledge_is_sent_is_no_change(bench):
+def test_a_rate_that_is_set_back_before_the_acknowledge_is_sent_is_no_change(bench, monkeypatch):
     async def scenario():
         uart = Wire()
         link = SerialLink(bench.requests, uart)
         await link.start()
         before = bench.device.parameters["serial_baud"]
-        for baud in (57600, before):
-            bench.device.parameters.set({"serial_baud": baud})
-        await asyncio.sleep(0)
-        assert uart.take() == []
+
+        def set_twice(_request, *, console):
+            for baud in (57600, before):
+                bench.device.parameters.set({"serial_baud": baud})
+            return [Reply(ReplyKind.ACK, 98)]
+
+        with monkeypatch.context() as context:
+            context.setattr(bench.requests, "handle", set_twice)
+            uart.arrive(CUBESPACE.encode_request(Request.of(98)))
+        assert uart.take() == [b"\x1f\x7f\x00\x1f\xff"]
         bench.device.parameters.set({"serial_baud": 57600})
-        await asyncio.sleep(0)
         assert uart.take() == [57600]
         await link.close()
 

@@ -1,8 +1,14 @@
 """The device on serial and CAN at once, over transports that only pass on what they are given."""
 
 import asyncio
+import contextlib
+import os
 import random
+import socket
+import tty
 from dataclasses import replace
+from itertools import pairwise
+from urllib.parse import urlsplit
 
 import pytest
 
@@ -17,6 +23,7 @@ from starhil.protocol.can.cubespace import CanHostReceiver, CanId, MessageType, 
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.transports.serial import open_serial
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
 from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
@@ -43,9 +50,8 @@ class Linked:
     def over_serial(self, identifier, data=b"", dialect=None) -> list[Reply | LinkFault]:
         request = Request.of(identifier, data)
         host = CUBESTAR.host(Dialect(dialect or self.bench.device.parameters["serial_dialect"]))
-        host.expect(request)
         self.uart.take()
-        self.uart.arrive(CUBESPACE.encode_request(request))
+        self.uart.arrive(host.request(request))
         return host.feed(b"".join(self.uart.take()), 0.0)
 
     def over_can(self, identifier, data=b"", source=1, destination=4) -> list[Reply | LinkFault]:
@@ -157,6 +163,24 @@ def test_the_answer_to_a_change_of_the_bit_rate_goes_out_at_the_old_one(bench):
             await asyncio.sleep(0)
         acknowledge = b"\x1f\x7f\x00\x1f\xff"
         assert linked.uart.take() == [acknowledge, 57600, acknowledge, acknowledge, 115200]
+
+    in_loop(scenario())
+
+
+def test_a_change_of_rate_and_dialect_waits_for_a_pending_answer(bench):
+    """The answer went out in the old dialect, but at the rate that another link had set meanwhile."""
+
+    async def scenario():
+        linked = await Linked(bench, "b").start()
+        waiting = []
+        bench.device._background = lambda _work, done: waiting.append(done)
+        linked.over_serial(bench.icd.telecommands["save_parameters"].id)
+        bench.device.parameters.set({"serial_baud": 57600, "serial_dialect": "a"})
+        await asyncio.sleep(0)
+        assert linked.uart.take() == []
+        waiting.pop()(None)
+        assert linked.uart.take() == [b"\x1f\x7f\x00\x1f\xff", 57600]
+        assert linked.serial.dialect == "a"
 
     in_loop(scenario())
 
@@ -347,6 +371,40 @@ def test_an_incomplete_message_is_abandoned_and_counted(bench, monkeypatch):
         assert bench.icd.telemetry["communication_status"].decode(reply.data)["uart_incomplete"]
         await linked.serial.close()
         await linked.can.close()
+
+    in_loop(scenario())
+
+
+@pytest.mark.parametrize("kind", ["pty", "tty", "listen"])
+def test_a_flood_on_the_serial_line_leaves_the_loop_to_others_after_some_80_faults(bench, kind):
+    """Of 64 kB, 1 365 faults were counted at once, and replies on CAN waited several times as long."""
+
+    async def scenario():
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        spec = {"pty": "pty", "tty": os.ttyname(slave), "listen": "listen://127.0.0.1:0"}[kind]
+        link = SerialLink(bench.requests, open_serial(spec, 921_600))
+        port = await link.start()
+        counts = [0]
+        with contextlib.ExitStack() as stack:
+            stack.callback(os.close, slave)
+            stack.callback(os.close, master)
+            peer = master
+            if kind == "pty":
+                peer = os.open(port, os.O_WRONLY | os.O_NOCTTY)
+                stack.callback(os.close, peer)
+            elif kind == "listen":
+                address = urlsplit(port)
+                peer = stack.enter_context(
+                    socket.create_connection((address.hostname, address.port))
+                ).fileno()
+            written = os.write(peer, b"\x1f\x7f\x80" * 1300)
+            async with asyncio.timeout(10.0):
+                while counts[-1] < written // 3 - 1:
+                    await asyncio.sleep(0)
+                    counts.append(sum(bench.device.counters.faults.values()))
+            await link.close()
+        assert max(after - before for before, after in pairwise(counts)) <= 86
 
     in_loop(scenario())
 

@@ -101,7 +101,7 @@ def events(dialect: Dialect, pending: int | None, data: bytes) -> list[str]:
     """What our receiver of the OBC's side makes of bytes, as the program prints it."""
     receiver = CUBESTAR.host(dialect)
     if pending is not None:
-        receiver.expect(Request.of(pending))
+        receiver.overhear(Request.of(pending))
     words: list[str] = []
     for event in receiver.feed(data, 0.0):
         if isinstance(event, LinkFault):

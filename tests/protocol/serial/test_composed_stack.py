@@ -133,9 +133,9 @@ def test_the_host_reads_replies(name: str, reply: Reply) -> None:
 def test_host_verifies_the_echo_before_the_reply() -> None:
     receiver = NOS3.host()
     request = REQUESTS["nos3"][2]
-    receiver.expect(request)
+    echo = receiver.request(request)
     reply = NOS3.encode_reply(Reply(ReplyKind.TELEMETRY, 2, b"\xbe\xef" * 4 + b"\x01", klass="telemetry"))
-    events = receiver.feed(NOS3.encode_request(request) + reply, 0.0)
+    events = receiver.feed(echo + reply, 0.0)
     assert [(event.kind, event.id, event.data) for event in events if isinstance(event, Reply)] == [
         (ReplyKind.TELEMETRY, 2, b"\xbe\xef" * 4 + b"\x01")
     ]
@@ -143,7 +143,7 @@ def test_host_verifies_the_echo_before_the_reply() -> None:
 
 def test_echo_that_differs_is_a_fault() -> None:
     receiver = NOS3.host()
-    receiver.expect(REQUESTS["nos3"][0])
+    receiver.overhear(REQUESTS["nos3"][0])
     wrong = NOS3.encode_request(REQUESTS["nos3"][1])
     assert faults(receiver.feed(wrong, 0.0))[0] is FaultKind.UART_PROTOCOL
 
@@ -151,7 +151,7 @@ def test_echo_that_differs_is_a_fault() -> None:
 def test_echo_is_the_ack_of_a_telecommand_that_has_no_other_answer() -> None:
     receiver = NOS3.host()
     request = REQUESTS["nos3"][0]
-    receiver.expect(request)
+    receiver.overhear(request)
     (reply,) = receiver.feed(NOS3.encode_reply(Reply.echo(request)), 0.0)
     assert isinstance(reply, Reply)
     assert (reply.kind, reply.id) == (ReplyKind.ACK, 0)

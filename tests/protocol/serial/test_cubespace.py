@@ -213,7 +213,7 @@ def test_replies_are_framed_and_read_in_each_dialect(dialect: Dialect, reply: Re
     receiver = CUBESPACE.host(dialect)
     assert reply.id is not None
     if reply.kind not in (ReplyKind.EVENT, ReplyKind.UNSOLICITED):
-        receiver.expect(Request.of(reply.id))
+        receiver.overhear(Request.of(reply.id))
     assert receiver.feed(bytes.fromhex(text), 0.0) == [reply]
 
 
@@ -222,7 +222,7 @@ def test_burst_packets_have_one_form_in_all_dialects(dialect: Dialect) -> None:
     text = CUBESPACE.encode_reply(BURST, dialect)
     assert text[:3] == b"\x1f\x7f\x77"
     receiver = CUBESPACE.host(dialect)
-    receiver.expect(Request.of(119, b"\x14\x01"))
+    receiver.overhear(Request.of(119, b"\x14\x01"))
     assert receiver.feed(CUBESPACE.encode_reply(Reply(ReplyKind.ACK, 119), dialect), 0.0) == [
         Reply(ReplyKind.ACK, 119)
     ]
@@ -258,7 +258,7 @@ def test_in_dialect_b_a_reply_to_nothing_is_a_fault() -> None:
 
 def test_in_dialect_b_one_expectation_takes_one_reply() -> None:
     receiver = CUBESPACE.host(Dialect.B)
-    receiver.expect(Request.of(230))
+    receiver.overhear(Request.of(230))
     events = receiver.feed(CUBESPACE.encode_reply(TELEMETRY, Dialect.B) * 2, 0.0)
     assert events[0] == TELEMETRY
     assert isinstance(events[1], LinkFault)
@@ -278,7 +278,7 @@ reply_data = st.binary(min_size=2, max_size=80).filter(lambda data: len(data) !=
 @given(st.sampled_from(Dialect), st.integers(128, 255), reply_data)
 def test_telemetry_comes_back_in_each_dialect(dialect: Dialect, identifier: int, data: bytes) -> None:
     receiver = CUBESPACE.host(dialect)
-    receiver.expect(Request.of(identifier))
+    receiver.overhear(Request.of(identifier))
     reply = Reply(ReplyKind.TELEMETRY, identifier, data)
     assert receiver.feed(CUBESPACE.encode_reply(reply, dialect), 0.0) == [reply]
 
@@ -290,7 +290,7 @@ def test_the_host_survives_any_bytes(dialect: Dialect, noise: list[bytes]) -> No
     for piece in noise:
         receiver.feed(piece, 0.0)
     receiver.feed(b"", 10.0)
-    receiver.expect(Request.of(230))
+    receiver.overhear(Request.of(230))
     events = receiver.feed(CUBESPACE.encode_reply(TELEMETRY, dialect), 10.0)
     assert events[-1] == TELEMETRY
 
@@ -302,6 +302,6 @@ def test_the_longest_row_is_read_in_each_dialect() -> None:
     )
     for dialect in Dialect:
         receiver = stack.host(dialect)
-        receiver.expect(Request.of(200))
+        receiver.overhear(Request.of(200))
         reply = Reply(ReplyKind.TELEMETRY, 200, data)
         assert receiver.feed(stack.encode_reply(reply, dialect), 0.0) == [reply]

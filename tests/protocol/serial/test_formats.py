@@ -78,19 +78,19 @@ def test_an_unknown_text_is_a_request_for_a_row_that_does_not_exist() -> None:
 
 def test_the_host_reads_each_format_and_names_the_request() -> None:
     host = STACK.host()
-    host.expect(COMMAND)
+    host.overhear(COMMAND)
     host_events = host.feed(b"READY\r\n", 0.0)
     assert [(event.kind, event.id) for event in host_events if isinstance(event, Reply)] == [
         (ReplyKind.ACK, 3)
     ]
-    host.expect(RECORD)
+    host.overhear(RECORD)
     sent = STACK.encode_reply(record(bytes(range(0xC0, 0xF3))))
     (reply,) = [event for byte in sent for event in host.feed(bytes((byte,)), 0.0)]
     assert isinstance(reply, Reply)
     assert (reply.kind, reply.id, reply.klass, reply.data) == (
         ReplyKind.TELEMETRY, 128, "record", bytes(range(0xC0, 0xF3)),
     )  # fmt: skip
-    host.expect(RECORD)
+    host.overhear(RECORD)
     (refusal,) = host.feed(b"ERROR 6\r\n", 0.0)
     assert isinstance(refusal, Reply)
     assert (refusal.kind, refusal.id, refusal.code) == (ReplyKind.NACK, 128, ErrorCode.BUSY)
@@ -100,7 +100,7 @@ def test_the_host_reads_each_format_and_names_the_request() -> None:
 def test_a_record_that_nobody_requested_is_a_fault(asked: Request | None) -> None:
     host = STACK.host()
     if asked is not None:
-        host.expect(asked)
+        host.overhear(asked)
     events = host.feed(STACK.encode_reply(record(bytes(51))), 0.0)
     assert events
     assert all(isinstance(event, LinkFault) for event in events)
@@ -119,7 +119,7 @@ def test_a_record_that_nobody_requested_is_a_fault(asked: Request | None) -> Non
 def test_a_text_that_answers_nothing_is_a_fault(text: bytes, asked: Request | None) -> None:
     host = STACK.host()
     if asked is not None:
-        host.expect(asked)
+        host.overhear(asked)
     (event,) = host.feed(text, 0.0)
     assert isinstance(event, LinkFault)
 
@@ -129,10 +129,10 @@ def test_a_damaged_record_is_flagged_and_the_next_read() -> None:
     for place in range(1, len(sent)):
         damaged, host = bytearray(sent), STACK.host()
         damaged[place] ^= 0x01
-        host.expect(RECORD)
+        host.overhear(RECORD)
         assert not [event for event in host.feed(bytes(damaged), 0.0) if isinstance(event, Reply)], place
         host.flush(1.0)
-        host.expect(RECORD)
+        host.overhear(RECORD)
         (reply,) = host.feed(sent, 2.0)
         assert isinstance(reply, Reply)
 

@@ -7,6 +7,7 @@ import os
 import subprocess
 import threading
 import time
+from itertools import pairwise
 
 import can
 import pytest
@@ -16,7 +17,7 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import TransportError
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.python_can import QUEUE_LIMIT, PythonCanTransport
-from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, can_pair, until
+from tests.protocol.transports.pairs import CAN_KINDS, DEADLINE_S, FRAMES, HAS_VCAN, can_pair, until
 
 
 @pytest.mark.parametrize("kind", CAN_KINDS)
@@ -59,6 +60,22 @@ def test_a_burst_passes_whole(kind: str) -> None:
                 assert pair.one.send(frame)
             await until(lambda: len(pair.got_two) >= len(burst))
             assert pair.got_two == burst
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("kind", ["hub", "slcan", CAN_KINDS[-1]])
+def test_a_burst_leaves_the_loop_to_others_after_some_15_frames(kind: str) -> None:
+    async def main() -> None:
+        async with can_pair(kind) as pair:
+            counts = [0]
+            for number in range(300):
+                pair.one.send(CanFrame(number, bytes(8), extended=False))
+            async with asyncio.timeout(DEADLINE_S):
+                while counts[-1] < 300:
+                    await asyncio.sleep(0)
+                    counts.append(len(pair.got_two))
+            assert max(after - before for before, after in pairwise(counts)) <= 16
 
     asyncio.run(main())
 

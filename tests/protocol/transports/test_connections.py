@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.can.socketcand import format_send
 from starhil.protocol.transports.can import open_can
-from starhil.protocol.transports.connections import WINDOW, FairQueue
-from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub
+from starhil.protocol.transports.connections import WINDOW
+from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub, FairQueue
 from tests.protocol.transports.pairs import until
 
 FLOOD = CanFrame(0x123, bytes(8), extended=False)

@@ -56,7 +56,7 @@ def test_decoders_survive_mutated_input_and_read_the_next_request(unit):
         for event in device.feed(mutated(requests, source, MARKS), now):
             decoded += decode(icd, event)
         row = source.choice(rows)
-        host.expect(icd.request(row))
+        host.overhear(icd.request(row))
         for event in host.feed(mutated(replies, source, MARKS), now):
             decoded += decode(icd, event)
     assert decoded > INPUTS // 10
