@@ -9,7 +9,8 @@ from typing import Annotated, Literal, Self, TypeAlias
 from pydantic import Field, RootModel, field_serializer, model_validator
 
 from starhil.emulator.run.faults import FaultRequest
-from starhil.emulator.truth.config import Strict, TruthConfig
+from starhil.emulator.simulation.config_model import Strict
+from starhil.emulator.truth.config import TruthConfig
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 
