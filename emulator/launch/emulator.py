@@ -69,10 +69,13 @@ class Emulator:
     ) -> None:
         check_heads(profiles)
         self.options = options = options or RunOptions()
+        self._recorder: Recorder | None = None
         if options.record is not None:
             if len(profiles) > 1:
                 raise EmulatorError("--record: records one head; run the others separately, or omit it")
-            wiring = Recorder(options.record, wiring or Wiring(make_clock(profiles[0].run.clock)))
+            wiring = self._recorder = Recorder(
+                options.record, wiring or Wiring(make_clock(profiles[0].run.clock))
+            )
         self.run = Run(profiles, wiring, worker, previews=options.watched)
         self.ended = asyncio.Event()
         """Set to end the run."""
@@ -107,11 +110,11 @@ class Emulator:
             raise
 
     async def _start(self, options: RunOptions, run: Run) -> None:
-        if run.recorder is not None:
+        if self._recorder is not None:
             from starhil.emulator.launch.recording import prepare_recording
 
-            prepare_recording(run.recorder.folder, run.profile, options.scenario)
-            self._files.append(run.recorder.open())
+            prepare_recording(self._recorder.folder, run.profile, options.scenario)
+            self._files.append(self._recorder.open())
         scenario = load_scenario(options.scenario) if options.scenario else None
         logs = self._open_logs()
         await run.open()
@@ -139,9 +142,9 @@ class Emulator:
                 path = path_of_head(options.truth_log, number)
                 logs.append((number, TruthLog(path, overwrite=options.overwrite, wall_times=wall_times)))
                 self._files.append(logs[-1][1].file)
-        if run.recorder is not None:
-            path = run.recorder.folder / TRUTH_FILE
-            logs.append((1, TruthLog(path, wall_times=wall_times, output=run.recorder.output)))
+        if self._recorder is not None:
+            path = self._recorder.folder / TRUTH_FILE
+            logs.append((1, TruthLog(path, wall_times=wall_times, output=self._recorder.output)))
             self._files.append(logs[-1][1].file)
         return logs
 
@@ -167,7 +170,7 @@ class Emulator:
         for head in self.run.heads:
             for link in head.links:
                 link.transport.stop_receiving()
-        recorder = self.run.recorder
+        recorder = self._recorder
         closers: list[Callable[[], object]] = [*reversed(self._closers), self.run.close]
         self._closers.clear()
         if self.control is not None:

@@ -260,12 +260,12 @@ class UnitUnderTest:
     def fault(self, fault: Mapping[str, Any]) -> None:
         """Inject faults, a request as on the control channel."""
         request = FaultRequest.model_validate(dict(fault))
-        self.run.record("fault", request=request.model_dump(mode="json"))
+        self.run.wiring.enter("fault", request=request.model_dump(mode="json"))
         self.head.faults.inject(request)
 
     def clear_faults(self) -> None:
         """End all faults."""
-        self.run.record("clear_faults")
+        self.run.wiring.enter("clear_faults")
         self.head.faults.clear()
 
     async def end_pipeline(self) -> None:

@@ -35,11 +35,10 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.profile.pipeline_setup import SensorPipeline
 from starhil.emulator.run.faults import Faults
 from starhil.emulator.run.pump import ClockPump
-from starhil.emulator.run.recorder import Recorder
 from starhil.emulator.run.revival import PipelineRevival
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.messages import PipelineReady, camera_constants
-from starhil.emulator.simulation.clock import Clock, SteppedClock
+from starhil.emulator.simulation.clock import Clock
 from starhil.emulator.simulation.guard import close_all
 from starhil.emulator.truth.truth import SensorTruth, Truth
 from starhil.protocol.can.frame import CanFrame
@@ -85,7 +84,6 @@ class Head:
         self.warm: PipelineReady | None = None
         """What the pipeline reported when it was last ready; None before."""
         self._wiring = wiring
-        self._recorder = wiring if isinstance(wiring, Recorder) else None
         self._on_warm = on_warm
         self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="state")
         self._pump: ClockPump | None = None
@@ -94,7 +92,7 @@ class Head:
         self._awake = asyncio.Event()
         store: StateStore = MemoryStore() if self._state_dir is None else FileStore(self._state_dir)
         self._closers: list[Callable[[], object]] = [store.close]
-        background = run_at_once if isinstance(self.clock, SteppedClock) else self._in_background()
+        background = run_at_once if self.clock.stepped else self._in_background()
         mount = None if profile.truth.mount is None else profile.truth.mount.build()
         try:
             self.device = Device(
@@ -137,7 +135,7 @@ class Head:
         """Open ports and buses; `automatic` is the CAN bus for the channel `auto`, such as that of another head."""
         links, seed = self.profile.links, self.profile.run.seed
         channel = automatic if links.can.channel == "auto" else links.can.channel
-        stepped = isinstance(self.clock, SteppedClock)  # no time passes between two items of one event
+        stepped = self.clock.stepped is not None  # no time passes between two items of one event
         if links.serial.port != "off" and self.icd.link.serial is not None:
             self.serial = SerialLink(self.requests, self._serial_transport(paced=not stepped), seed)
             self._add(self.serial)
@@ -217,9 +215,9 @@ class Head:
 
     def begin(self) -> None:
         """Start the pipeline; `ready` waits for it."""
-        if not isinstance(self.clock, SteppedClock):
-            self._pump = ClockPump(self.device.scheduler, self.clock, self._recorder)
-        self._revival = PipelineRevival(self.imager, self.device, self.pipeline_ready, self._record)
+        if self.clock.stepped is None:
+            self._pump = ClockPump(self.device.scheduler, self._wiring)
+        self._revival = PipelineRevival(self.imager, self.device, self.pipeline_ready, self._wiring.enter)
         self._warm_up_task = asyncio.create_task(self._warm_up())
 
     async def _warm_up(self) -> None:
@@ -228,7 +226,7 @@ class Head:
         try:
             warm = await self.imager.start()
             log.info("pipeline ready: %d stars, %.2f s", warm.stars, warm.seconds)
-            self._record("ready")
+            self._wiring.enter("ready")
             device.signals.mode_changed.connect(self._mode_changed)
             device.signals.restarted.connect(self._device_reset)
             self.pipeline_ready(warm)
@@ -236,12 +234,8 @@ class Head:
             raise EmulatorError(f"{self.profile.source_of(error)}: {error}") from None
         except ProtocolError as error:  # a camera constant is outside the limits of its parameter
             raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None
-        if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
+        if self.clock.stepped or device.modes.mode is not Mode.BOOT:
             self._awake.set()
-
-    def _record(self, kind: str) -> None:
-        if self._recorder is not None:
-            self._recorder.enter(kind)
 
     def _mode_changed(self, transition: Transition) -> None:
         if transition.before is Mode.BOOT:

@@ -17,6 +17,7 @@ from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.profile import Profile
 from starhil.emulator.run.pump import ClockPump
+from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.client import PipelineReply, PipelineRequest
 from starhil.emulator.sensor.pipeline.messages import (
     FrameResult,
@@ -229,7 +230,7 @@ class SimulatedUnit:
             self._damage(self)
         self.device.power_on()
         await self.link.start()
-        self.pump = ClockPump(self.device.scheduler, self.device.clock)
+        self.pump = ClockPump(self.device.scheduler, Wiring(self.device.clock))
         self.pump.start()
         self.device.pipeline_ready({})
 

@@ -108,7 +108,7 @@ def test_a_writer_on_a_full_disk_fails_alone(run, tmp_path, caplog, work, keys, 
 def test_what_cannot_be_written_at_all_does_not_stop_frames(run, tmp_path, caplog):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
-        emulation.recorder.write("input", data=object())  # not JSON
+        emulation.wiring.write("input", data=object())  # not JSON
         return await track(emulation)
 
     assert run(scenario, options=RunOptions(record=tmp_path / "recorded")) > 0
