@@ -214,6 +214,7 @@ def command(
     import logging
 
     from starhil.emulator.launch import Emulator, with_own_seeds
+    from starhil.emulator.links.table import LINKS
     from starhil.emulator.profile import DEFAULT_PROFILE
 
     levels = ("debug", "info", "warning", "error")
@@ -227,8 +228,9 @@ def command(
         )
     names = head or [profile or DEFAULT_PROFILE]
     profiles = with_own_seeds([device.profile(name, number) for number, name in enumerate(names, start=1)])
-    links = [each.links for each in profiles]
-    reachable = any((on.serial.port, on.can.channel, on.canopen.node) != ("off", "off", 0) for on in links)
+    reachable = any(
+        kind.setting(each.links) not in ("off", 0) for each in profiles for kind in LINKS.values()
+    )
     observed = around.truth_log or around.record or (around.control, around.view) != ("off", "off")
     if not reachable and not observed:
         raise EmulatorError(

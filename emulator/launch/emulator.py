@@ -12,6 +12,7 @@ from starhil.emulator.console.obc import MakeClient
 from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.table import LINKS
 from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
 from starhil.emulator.run.recorder import TRUTH_FILE, Recorder
@@ -168,7 +169,7 @@ class Emulator:
         First of all, nothing more is received: closing takes many turns of the loop, which a storm of requests makes long.
         """
         for head in self.run.heads:
-            for link in head.links:
+            for link in head.links.values():
                 link.transport.stop_receiving()
         recorder = self._recorder
         closers: list[Callable[[], object]] = [*reversed(self._closers), self.run.close]
@@ -246,11 +247,8 @@ def check_heads(profiles: Sequence[Profile]) -> None:
                 f"--head {profile.source}: run.clock is {profile.run.clock}, but {first.source} has "
                 f"{first.run.clock}; heads share a clock, give --clock"
             )
-        links = profile.links
         for key, bus, number in (
-            ("links.can.address", links.can.channel if links.can.channel != "off" else "", links.can.address),
-            ("links.canopen.node", links.can.channel if links.canopen.node else "", links.canopen.node),
-            ("links.serial.port", _fixed_port(links.serial.port), 0),
+            *(kind.exclusive(profile.links) for kind in LINKS.values()),
             ("run.state_dir", profile.run.state_dir and str(profile.folder / profile.run.state_dir), 0),
         ):
             if not bus:
@@ -261,8 +259,3 @@ def check_heads(profiles: Sequence[Profile]) -> None:
                 raise EmulatorError(
                     f"--head {profile.source}: {key} is {value}, as in {other.source}; change one of them"
                 )
-
-
-def _fixed_port(port: str) -> str:
-    """Return the port of a serial link if only one head can use it, otherwise an empty text."""
-    return "" if port in ("auto", "off") or port.endswith(":0") else port

@@ -19,6 +19,7 @@ from starhil.emulator.device.device import Background, outcome
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.launch.recording import read_recorded, read_run, validated
 from starhil.emulator.launch.replay_differences import difference_of_truth, difference_sent, units_sent
+from starhil.emulator.links.table import LINKS, LinkName
 from starhil.emulator.links.traffic import Decoder, WireItem
 from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
@@ -120,7 +121,7 @@ class _Item(_Timed):
     """An item on a link."""
 
     do: Literal["in", "out"]
-    link: Literal["serial", "can", "canopen"]
+    link: LinkName
     data: str | tuple[int, str, bool, bool]
 
     @cached_property
@@ -131,10 +132,10 @@ class _Item(_Timed):
     @model_validator(mode="after")
     def _check_item(self) -> Self:
         try:
-            is_serial = isinstance(self.item, bytes)
+            is_of_link = isinstance(self.item, LINKS[self.link].carries)
         except ProtocolError as error:
             raise ValueError(str(error)) from None
-        if is_serial != (self.link == "serial"):
+        if not is_of_link:
             raise ValueError(f"data: not that of the link {self.link}")
         return self
 

@@ -89,6 +89,12 @@ class SerialLink(RequestLink[bytes, Dialect | None]):
             return next(iter(self._stack.dialects), None)
         return Dialect(str(self._device.parameters["serial_dialect"]))
 
+    @property
+    def ready_fields(self) -> dict[str, str]:
+        """Fields of the ready line, with the dialect at the start."""
+        dialect = {} if self.dialect is None else {"dialect": self.dialect.value}
+        return super().ready_fields | dialect
+
     def _reply_style(self) -> Dialect | None:
         return self.dialect
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any, Final, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -91,13 +91,13 @@ BUSES: Final = tuple(name for name in FaultRequest.model_fields if name not in (
 class Faults:
     """The currently injected faults, also of links that are opened later."""
 
-    def __init__(self, device: Device, links: Sequence[AnyLink]) -> None:
+    def __init__(self, device: Device, links: Mapping[str, AnyLink]) -> None:
         self._device = device
         self._links = links
 
     @property
     def _wires(self) -> list[tuple[str, WireFaults[Any]]]:
-        return [(link.bus, link.wire) for link in self._links]
+        return [(link.bus, link.wire) for link in self._links.values()]
 
     def inject(self, request: FaultRequest) -> None:
         """Inject the faults of a request, all or none."""

@@ -22,9 +22,10 @@ import time
 from collections.abc import Callable, Sequence
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.table import check_links
 from starhil.emulator.profile import Profile
 from starhil.emulator.profile.pipeline_setup import SensorPipeline, make_pipeline
-from starhil.emulator.run.head import Head, check_links
+from starhil.emulator.run.head import Head
 from starhil.emulator.run.pump import StepPump
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
@@ -110,7 +111,7 @@ class Run:
         """Start the pipelines; time passes beyond the boot when all are ready."""
         if (stepped := self.clock.stepped) is not None:
             devices = [(head.device.scheduler, head.imager) for head in self.heads]
-            transports = [link.transport for head in self.heads for link in head.links]
+            transports = [link.transport for head in self.heads for link in head.links.values()]
             self.stepper = StepPump(devices, transports, stepped, self.time_passes, self.wiring)
         self.wiring.begin()
         for head in self.heads:

@@ -62,6 +62,7 @@ def part_of(run, path):
     found = run
     for name in path:
         found = getattr(found, name)
+        found = next(iter(found.values())) if name == "links" else found
         found = found[0] if isinstance(found, list) else found
     return found
 
