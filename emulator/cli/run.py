@@ -158,7 +158,7 @@ class AroundOptions:
         """Return the options of the run; the folders of its files are created."""
         from starhil.emulator.cli.console_client import ConsoleClient
         from starhil.emulator.control.token import check_token
-        from starhil.emulator.launch import RunOptions
+        from starhil.emulator.launch import ConsoleOptions, RunOptions
 
         for option, token in (("--control-token", self.control_token), ("--view-token", self.view_token)):
             if token is not None:
@@ -176,10 +176,9 @@ class AroundOptions:
             control_token=self.control_token or "",
             scenario=self.scenario,
             record=folder,
-            view=self.view,
-            view_token=self.view_token or "",
-            mcap=mcap,
-            make_client=ConsoleClient,
+            console=None
+            if (self.view, mcap) == ("off", None)
+            else ConsoleOptions(ConsoleClient, self.view, self.view_token or "", mcap),
         )
 
 

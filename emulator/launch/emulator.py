@@ -24,6 +24,20 @@ from starhil.emulator.simulation.guard import close_all
 from starhil.emulator.simulation.output_file import OutputFile
 
 
+@dataclass(frozen=True)
+class ConsoleOptions:
+    """Options of console and MCAP file, which use images and have an OBC on the bus of each head."""
+
+    make_client: MakeClient
+    """Makes the OBC."""
+    view: str = "off"
+    """Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT."""
+    view_token: str = ""
+    """Token of pages that may look but not command; empty for none."""
+    mcap: Path | None = None
+    """MCAP file of images, truth, telemetry and events; one file per head (`path_of_head`)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """Options of a run that are not part of the profile."""
@@ -40,19 +54,8 @@ class RunOptions:
     """Name or path of a scenario; empty for none."""
     record: Path | None = None
     """Folder of a recording of the run, for a replay."""
-    view: str = "off"
-    """Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT."""
-    view_token: str = ""
-    """Token of pages that may look but not command; empty for none."""
-    mcap: Path | None = None
-    """MCAP file of images, truth, telemetry and events; one file per head (`path_of_head`)."""
-    make_client: MakeClient | None = None
-    """Makes the OBC for console and MCAP file; required for these."""
-
-    @property
-    def watched(self) -> bool:
-        """Whether a console or an MCAP file uses the images."""
-        return self.view != "off" or self.mcap is not None
+    console: ConsoleOptions | None = None
+    """Console and MCAP file; None for neither."""
 
 
 class Emulator:
@@ -77,7 +80,7 @@ class Emulator:
             wiring = self._recorder = Recorder(
                 options.record, wiring or Wiring(make_clock(profiles[0].run.clock))
             )
-        self.run = Run(profiles, wiring, worker, previews=options.watched)
+        self.run = Run(profiles, wiring, worker, previews=options.console is not None)
         self.ended = asyncio.Event()
         """Set to end the run."""
         self.control: ControlServer | None = None
@@ -125,12 +128,12 @@ class Emulator:
             for head in run.heads:
                 events = scenario.prepare(head, run.truth if head.number == 1 else None)
                 head.device.scheduler.add(events)
-        if options.control != "off" or options.watched:
+        if options.control != "off" or options.console is not None:
             self.control = ControlServer(run, self.ended.set, options.control_token)
-        if self.control is not None and options.control != "off":
-            self.ready_fields["control"] = await self.control.start(options.control)
-        if self.control is not None and options.watched:
-            await self._open_console(self.control)
+            if options.control != "off":
+                self.ready_fields["control"] = await self.control.start(options.control)
+            if options.console is not None:
+                await self._open_console(options.console, self.control)
         run.begin()
 
     def _open_logs(self) -> list[tuple[int, TruthLog]]:
@@ -183,24 +186,21 @@ class Emulator:
             closers.append(recorder.discard)
         await close_all(closers)
 
-    async def _open_console(self, control: ControlServer) -> None:
+    async def _open_console(self, options: ConsoleOptions, control: ControlServer) -> None:
         """Open console and MCAP files, with an OBC on the bus of each head."""
         from starhil.emulator.console.obc_link import open_obc
 
-        if self.options.make_client is None:
-            raise EmulatorError("run: console and recording need make_client")
-        make_client = self.options.make_client
-        clients = [await open_obc(head, make_client, self._closers) for head in self.run.heads]
-        if self.options.mcap is not None:
+        clients = [await open_obc(head, options.make_client, self._closers) for head in self.run.heads]
+        if options.mcap is not None:
             from starhil.emulator.console.mcap import McapRecorder
 
             for head, client in zip(self.run.heads, clients, strict=True):
-                path = path_of_head(self.options.mcap, head.number)
+                path = path_of_head(options.mcap, head.number)
                 recorder = McapRecorder(head, client, path, overwrite=self.options.overwrite)
                 self._closers.append(recorder.close)
                 self._files.append(recorder.file)
                 recorder.start()
-        if self.options.view != "off":
+        if options.view != "off":
             from starhil.emulator.console.console import Console
             from starhil.emulator.console.reported_runs import ReportedRuns
             from starhil.emulator.console.server import ConsoleServer
@@ -214,9 +214,9 @@ class Emulator:
                 self._closers.append(console.close)
                 console.start()
                 consoles.append(console)
-            server = ConsoleServer(consoles, self.options.view_token)
+            server = ConsoleServer(consoles, options.view_token)
             self._closers.append(server.close)
-            self.ready_fields |= await server.start(self.options.view)
+            self.ready_fields |= await server.start(options.view)
 
 
 def path_of_head(path: Path, number: int) -> Path:

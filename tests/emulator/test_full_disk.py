@@ -6,7 +6,7 @@ import resource
 import pytest
 
 from starhil.emulator.cli.console_client import ConsoleClient
-from starhil.emulator.launch import RunOptions
+from starhil.emulator.launch import ConsoleOptions, RunOptions
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import command, every_row_read
 
@@ -74,7 +74,7 @@ WRITERS = {
     "truth log": (track, lambda tmp: {"options": RunOptions(truth_log=tmp / "truth.csv")}, "truth.csv"),
     "mcap": (
         track_with_telemetry,
-        lambda tmp: {"options": RunOptions(mcap=tmp / "run.mcap", make_client=ConsoleClient)},
+        lambda tmp: {"options": RunOptions(console=ConsoleOptions(ConsoleClient, mcap=tmp / "run.mcap"))},
         "run.mcap",
     ),
     "state": (
