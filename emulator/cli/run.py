@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,6 +19,7 @@ from starhil.emulator.cli.options import (
     names_of,
 )
 from starhil.emulator.cli.output import report_slow_start
+from starhil.emulator.console.recorders import RECORDERS
 from starhil.emulator.errors import EmulatorError
 from starid.cli.output import output_help, prepare_output
 
@@ -149,8 +150,9 @@ class AroundOptions:
     record: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Record to a folder (for `starhil replay`) or to FILE.mcap (for Foxglove). Missing folders are created. "
-            "Repeatable."
+            help="Record to a folder (for `starhil replay`)"
+            + "".join(f" or to FILE{suffix} ({kind.use})" for suffix, kind in RECORDERS.items())
+            + ". Missing folders are created. Repeatable."
         ),
     ] = None
 
@@ -165,8 +167,10 @@ class AroundOptions:
                 check_token(option, token)
         if self.view_token is not None and self.view == "off":
             raise EmulatorError("--view-token: needs --view")
-        folder, mcap = (_one_path(self.record, mcap=mcap) for mcap in (False, True))
-        for path, option in ((self.truth_log, "--truth-log"), (mcap, "--record")):
+        records = _by_format(self.record or ())
+        folder = records.pop("", None)
+        files = tuple(records.values())
+        for path, option in ((self.truth_log, "--truth-log"), *((file, "--record") for file in files)):
             if path is not None:
                 prepare_output(path, option)
         return RunOptions(
@@ -177,8 +181,8 @@ class AroundOptions:
             scenario=self.scenario,
             record=folder,
             console=None
-            if (self.view, mcap) == ("off", None)
-            else ConsoleOptions(ConsoleClient, self.view, self.view_token or "", mcap),
+            if self.view == "off" and not files
+            else ConsoleOptions(ConsoleClient, self.view, self.view_token or "", files),
         )
 
 
@@ -282,13 +286,16 @@ def _absolute_folder(unit: str) -> str:
     return unit if unit in bundled_units() else str(find_unit(unit).absolute())
 
 
-def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
-    """Return the MCAP file of `--record`, or its folder; None without the option."""
-    found = [path for path in paths or () if (path.suffix == ".mcap") == mcap]
-    if len(found) > 1:
-        kind = "MCAP file" if mcap else "folder"
-        raise EmulatorError(f"--record {found[1]}: one {kind} per run, and {found[0]} is one already")
-    return found[0] if found else None
+def _by_format(paths: Sequence[Path]) -> dict[str, Path]:
+    """Return the files of `--record` by suffix, and the folder by the empty suffix."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        suffix = path.suffix if path.suffix in RECORDERS else ""
+        other = found.setdefault(suffix, path)
+        if other is not path:
+            kind = f"{suffix[1:].upper()} file" if suffix else "folder"
+            raise EmulatorError(f"--record {path}: one {kind} per run, and {other} is one already")
+    return found
 
 
 def _as_toml(value: str | float) -> str:

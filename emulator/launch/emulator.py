@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from starhil.emulator.console.obc import MakeClient
+from starhil.emulator.console.recorders import RECORDERS
 from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.errors import EmulatorError
@@ -26,7 +27,7 @@ from starhil.emulator.simulation.output_file import OutputFile
 
 @dataclass(frozen=True)
 class ConsoleOptions:
-    """Options of console and MCAP file, which use images and have an OBC on the bus of each head."""
+    """Options of console and recorders, which use images and have an OBC on the bus of each head."""
 
     make_client: MakeClient
     """Makes the OBC."""
@@ -34,8 +35,8 @@ class ConsoleOptions:
     """Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT."""
     view_token: str = ""
     """Token of pages that may look but not command; empty for none."""
-    mcap: Path | None = None
-    """MCAP file of images, truth, telemetry and events; one file per head (`path_of_head`)."""
+    files: tuple[Path, ...] = ()
+    """Files of recorders (`RECORDERS`); each is one file per head (`path_of_head`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +56,7 @@ class RunOptions:
     record: Path | None = None
     """Folder of a recording of the run, for a replay."""
     console: ConsoleOptions | None = None
-    """Console and MCAP file; None for neither."""
+    """Console and recorders; None for neither."""
 
 
 class Emulator:
@@ -87,7 +88,7 @@ class Emulator:
         self.ready_fields: dict[str, str] = {}
         """Addresses of control channel and console."""
         self._closers: list[Callable[[], object]] = []
-        """Closers of console and MCAP file, in the order of opening."""
+        """Closers of console and recorders, in the order of opening."""
         self._files: list[OutputFile] = []
         """Logs and recordings that the run writes."""
         self._rejected = False
@@ -187,16 +188,14 @@ class Emulator:
         await close_all(closers)
 
     async def _open_console(self, options: ConsoleOptions, control: ControlServer) -> None:
-        """Open console and MCAP files, with an OBC on the bus of each head."""
+        """Open console and recorders, with an OBC on the bus of each head."""
         from starhil.emulator.console.obc_link import open_obc
 
         clients = [await open_obc(head, options.make_client, self._closers) for head in self.run.heads]
-        if options.mcap is not None:
-            from starhil.emulator.console.mcap import McapRecorder
-
+        for file in options.files:
             for head, client in zip(self.run.heads, clients, strict=True):
-                path = path_of_head(options.mcap, head.number)
-                recorder = McapRecorder(head, client, path, overwrite=self.options.overwrite)
+                path = path_of_head(file, head.number)
+                recorder = RECORDERS[file.suffix].make(head, client, path, self.options.overwrite)
                 self._closers.append(recorder.close)
                 self._files.append(recorder.file)
                 recorder.start()

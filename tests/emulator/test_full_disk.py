@@ -74,7 +74,7 @@ WRITERS = {
     "truth log": (track, lambda tmp: {"options": RunOptions(truth_log=tmp / "truth.csv")}, "truth.csv"),
     "mcap": (
         track_with_telemetry,
-        lambda tmp: {"options": RunOptions(console=ConsoleOptions(ConsoleClient, mcap=tmp / "run.mcap"))},
+        lambda tmp: {"options": RunOptions(console=ConsoleOptions(ConsoleClient, files=(tmp / "run.mcap",)))},
         "run.mcap",
     ),
     "state": (

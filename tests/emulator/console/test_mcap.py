@@ -21,7 +21,7 @@ JSON_TYPES = {"object": dict, "string": str, "number": (int, float), "integer": 
 
 
 def options(path, **more):
-    return RunOptions(console=ConsoleOptions(ConsoleClient, mcap=path), **more)
+    return RunOptions(console=ConsoleOptions(ConsoleClient, files=(path,)), **more)
 
 
 def messages(path):

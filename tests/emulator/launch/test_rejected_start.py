@@ -15,7 +15,7 @@ def options(tmp_path, view="off", **more):
     return RunOptions(
         record=tmp_path / "recorded",
         truth_log=tmp_path / "truth.csv",
-        console=ConsoleOptions(ConsoleClient, view, mcap=tmp_path / "run.mcap"),
+        console=ConsoleOptions(ConsoleClient, view, files=(tmp_path / "run.mcap",)),
         **more,
     )
 
