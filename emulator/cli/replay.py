@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -31,7 +32,6 @@ def command(
     and 2 if the recording cannot be played.
     """
     import asyncio
-    import json
 
     from starhil.emulator.errors import EmulatorError
     from starhil.emulator.launch.replay import replay

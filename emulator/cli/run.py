@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import logging
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +24,7 @@ from starhil.emulator.cli.options import (
 from starhil.emulator.cli.output import report_slow_start
 from starhil.emulator.console.recorders import RECORDERS
 from starhil.emulator.errors import EmulatorError
+from starhil.protocol.files.bundled import bundled_units, find_unit
 from starid.cli.output import output_help, prepare_output
 
 if TYPE_CHECKING:
@@ -213,9 +217,6 @@ def command(
 
     worker = take_worker()  # first, to start up in parallel with the imports below
 
-    import asyncio
-    import logging
-
     from starhil.emulator.launch import Emulator, with_own_seeds
     from starhil.emulator.links.table import LINKS
     from starhil.emulator.profile import DEFAULT_PROFILE
@@ -246,9 +247,7 @@ def command(
 
 async def _serve(make: Callable[[], Emulator]) -> int:
     """Run an emulator, made in the event loop, until a signal or the control channel ends it; return the exit status."""
-    import asyncio
     import gc
-    import signal
 
     from starhil.emulator.simulation.guard import log_loop_errors_once
 
@@ -281,8 +280,6 @@ async def _serve(make: Callable[[], Emulator]) -> int:
 
 def _absolute_folder(unit: str) -> str:
     """Return a folder from the command line as an absolute path; a profile would resolve it differently."""
-    from starhil.protocol.files.bundled import bundled_units, find_unit
-
     return unit if unit in bundled_units() else str(find_unit(unit).absolute())
 
 
