@@ -19,8 +19,8 @@ from starhil.emulator.run.recorder import (
     STATE_FOLDER,
 )
 from starhil.emulator.truth.config import FileConfig
+from starhil.protocol.files.user_file import read_user_text
 from starhil.protocol.files.validation import problems
-from starid.storage.files import read_text
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -94,7 +94,7 @@ def read_run(folder: Path) -> tuple[Profile, bool]:
 def read_recorded(path: Path) -> str:
     """Read a file of a recording; an error names it."""
     with explained(f"replay {path}: cannot be read", errors=(OSError, UnicodeDecodeError)):
-        text = read_text(path)
+        text = read_user_text(path)
     return text  # noqa: RET504 (mypy expects that the block may be left without a result)
 
 
