@@ -14,7 +14,7 @@ from starhil.emulator.console.pointing import DEFAULT_RATE_DEG_S
 from starhil.emulator.links.table import BUSES, LINKS
 from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.run import Run
-from starhil.emulator.run.faults import NO_ERROR, DeviceFault
+from starhil.emulator.run.faults import EFFECTS, DeviceFault
 from starhil.emulator.run.head import Head
 from starhil.emulator.sensor.sky.objects import SkyObjects
 from starhil.protocol.files.bundled import bundled
@@ -98,8 +98,7 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
 def fault_controls(icd: InterfaceDefinition, buses: list[str]) -> list[dict[str, Any]]:
     """Return the controls for faults by level: name, kind and range of each value."""
     choices = {
-        "error": [name for name, code in icd.enum("device_error").values.items() if code != NO_ERROR],
-        "reset": list(icd.enum("reset_cause").values),
+        **{key: effect.names(icd) for key, effect in EFFECTS.items() if effect.enum},
         "parameter": list(icd.device_parameters),
     }
     share = {"name": "blocked_share", "kind": "number", "min": 0.0, "max": 1.0, "default": 0.0}
