@@ -28,6 +28,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from starhil.emulator.truth.config import models_in
+
 ROOT: Final = Path(__file__).resolve().parent.parent
 DOCS: Final = ROOT / "docs"
 MODEL_FILE: Final = ROOT / "configs" / "units" / "model.toml"
@@ -206,13 +208,6 @@ def default(field: FieldInfo, schema: Mapping[str, Any] | None = None) -> str:
     if field.default and (schema or {}).get("format") == "hex":
         return f"`0x{field.default:02X}`"
     return "" if field.default is PydanticUndefined else literal(field.default)
-
-
-def models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models in an annotation."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for inner in get_args(annotation) for model in models_in(inner)]
 
 
 # --- the tables ---

@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
@@ -33,18 +33,45 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class DeviceOptions:
-    """What replaces keys of the profile of every head."""
+class Key:
+    """The key of the profile that an option replaces."""
 
-    unit: UnitChoice = None
+    name: str
+    value: Callable[[Any, int], Any] = lambda value, _number: value
+    """Returns the value of the key for the nth head; folders and links differ by head."""
+
+
+def _state_dir(folder: Path, number: int) -> str:
+    own_folder = "" if number == 1 else f"head-{number}"  # in the folder of the first
+    return str(folder.resolve() / own_folder)
+
+
+def _symlink(path: Path, number: int) -> str:
+    from starhil.emulator.launch import path_of_head
+
+    return str(path_of_head(path.absolute(), number))
+
+
+def _absolute_folder(unit: str, _number: int) -> str:
+    """Return a folder from the command line as an absolute path; a profile would resolve it differently."""
+    return unit if unit in bundled_units() else str(find_unit(unit).absolute())
+
+
+@dataclass(frozen=True)
+class DeviceOptions:
+    """What replaces keys of the profile of every head; an option that names no key changes nothing."""
+
+    unit: Annotated[UnitChoice, Key("unit", _absolute_folder)] = None
     serial: Annotated[
         str | None,
+        Key("links.serial.port"),
         typer.Option(
             help="Serial link: auto (a pty), a device path, listen://HOST:PORT, or off. Default: the profile's (auto)."
         ),
     ] = None
     dialect: Annotated[
         str | None,
+        Key("links.serial.dialect"),
         typer.Option(
             help="Format of serial replies: a for OBC software written for the CubeComputer (replies begin with the "
             "row ID), b for a stand-alone node (no ID), c for generation 2. With the wrong dialect, values are shifted by "
@@ -53,19 +80,24 @@ class DeviceOptions:
     ] = None
     can: Annotated[
         str | None,
+        Key("links.can.channel"),
         typer.Option(
             help="CAN link: auto (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a channel, or off. Default: the profile's (auto)."
         ),
     ] = None
     canopen: Annotated[
         int | None,
+        Key("links.canopen.node"),
         typer.Option(
             min=0, max=127, help="Also run a CANopen node with this ID; 0: off. Default: the profile's (0)."
         ),
     ] = None
-    seed: Annotated[int | None, typer.Option(help="Random seed. Default: the profile's (1).")] = None
+    seed: Annotated[
+        int | None, Key("run.seed"), typer.Option(help="Random seed. Default: the profile's (1).")
+    ] = None
     clock: Annotated[
         str | None,
+        Key("run.clock"),
         typer.Option(
             help="Simulation clock: real, scaled:FACTOR, or stepped (advances only on request, for repeatable runs). "
             "Default: the profile's (real)."
@@ -73,34 +105,28 @@ class DeviceOptions:
     ] = None
     state_dir: Annotated[
         Path | None,
+        Key("run.state_dir", _state_dir),
         typer.Option(
             help="Folder for state that survives restarts, such as saved parameters. Default: no state is kept."
         ),
     ] = None
-    symlink: Annotated[Path | None, typer.Option(help="Symbolic link to the pty; removed at the end.")] = None
+    symlink: Annotated[
+        Path | None,
+        Key("links.serial.symlink", _symlink),
+        typer.Option(help="Symbolic link to the pty; removed at the end."),
+    ] = None
     settings: Settings = None
 
     def profile(self, name: str, number: int) -> Profile:
-        """Load the profile of the nth head, with the options in place of its keys; folders and links differ by head."""
-        from starhil.emulator.launch import path_of_head
+        """Load the profile of the nth head, with the options in place of its keys."""
         from starhil.emulator.profile import load_profile
 
-        state_dir, symlink = self.state_dir, self.symlink
-        own_folder = "" if number == 1 else f"head-{number}"  # in the folder of the first
-        values = {
-            "unit": None if self.unit is None else _absolute_folder(self.unit),
-            "links.serial.port": self.serial,
-            "links.serial.dialect": self.dialect,
-            "links.can.channel": self.can,
-            "links.canopen.node": self.canopen,
-            "run.clock": self.clock,
-            "run.seed": self.seed,
-            "run.state_dir": None if state_dir is None else str(state_dir.resolve() / own_folder),
-            "links.serial.symlink": None
-            if symlink is None
-            else str(path_of_head(symlink.absolute(), number)),
-        }
-        overrides = [f"{key}={_as_toml(value)}" for key, value in values.items() if value is not None]
+        overrides = [
+            f"{key.name}={_as_toml(key.value(value, number))}"
+            for option, hint in get_type_hints(type(self), include_extras=True).items()
+            for key in get_args(hint)
+            if isinstance(key, Key) and (value := getattr(self, option)) is not None
+        ]
         return load_profile(name, [*(self.settings or ()), *overrides])
 
 
@@ -276,11 +302,6 @@ async def _serve(make: Callable[[], Emulator]) -> int:
     finally:
         await emulator.close()
     return int(emulator.failed)
-
-
-def _absolute_folder(unit: str) -> str:
-    """Return a folder from the command line as an absolute path; a profile would resolve it differently."""
-    return unit if unit in bundled_units() else str(find_unit(unit).absolute())
 
 
 def _by_format(paths: Sequence[Path]) -> dict[str, Path]:

@@ -18,7 +18,7 @@ from starhil.emulator.run.recorder import (
     SCENARIO_FILE,
     STATE_FOLDER,
 )
-from starhil.emulator.truth.config import FileConfig
+from starhil.emulator.truth.config import path_keys
 from starhil.protocol.files.user_file import read_user_text
 from starhil.protocol.files.validation import problems
 
@@ -56,9 +56,9 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     values = profile.model_dump(mode="json")
     # what the profile does not set is the unit's, which may have no dialects and another bit rate
     values["links"]["serial"] = profile.links.serial.model_dump(mode="json", exclude_unset=True)
-    if isinstance(profile.truth, FileConfig):
-        shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
-        values["truth"]["path"] = TRUTH_SOURCE_FILE
+    for key in path_keys(type(profile.truth)):
+        shutil.copyfile(profile.folder / getattr(profile.truth, key), folder / _copy_of(key))
+        values["truth"][key] = _copy_of(key)
     state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
     if state is not None:
         values["run"]["state_dir"] = STATE_FOLDER
@@ -76,6 +76,11 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
 
 
+def _copy_of(key: str) -> str:
+    """Return the name in a recording of the file that a key of the truth names."""
+    return TRUTH_SOURCE_FILE if key == "path" else f"truth_{key}"
+
+
 def read_run(folder: Path) -> tuple[Profile, bool]:
     """Return the profile of a recording, and whether its tape ends with the entry `end`."""
     path = folder / RUN_FILE
@@ -85,9 +90,8 @@ def read_run(folder: Path) -> tuple[Profile, bool]:
         raise EmulatorError(f"{error}; give a folder made by starhil run --record") from None
     run = validated(_RunFile, text, path)
     truth = run.profile.truth
-    if isinstance(truth, FileConfig):
-        truth = truth.model_copy(update={"path": str((folder / truth.path).absolute())})
-    profile = run.profile.model_copy(update={"truth": truth})
+    copies = {key: str((folder / getattr(truth, key)).absolute()) for key in path_keys(type(truth))}
+    profile = run.profile.model_copy(update={"truth": truth.model_copy(update=copies)})
     return profile.read_from(Path(run.folder) / RUN_FILE), run.ends
 
 

@@ -40,6 +40,8 @@ from starhil.emulator.truth.config import (
     Strict,
     TruthConfig,
     UserPath,
+    models_in,
+    path_keys,
 )
 from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError, remedy
 from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled_units, find, not_found
@@ -181,8 +183,12 @@ CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1"
 OF_CAMERA: Final = CALIBRATION | {"limiting_magnitude"}
 """Device parameters that are not inherited by a profile with another camera."""
 
+
 PATHS: Final = frozenset(
-    {"truth.path", "orbit.path", "catalog.path", "images.folder", "images.dark", "run.state_dir"}
+    f"{table}.{key}"
+    for table, field in Profile.model_fields.items()
+    for model in models_in(field.annotation)
+    for key in path_keys(model)
 )
 """Keys of files and folders, which refer to the folder of the profile that has them."""
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from starhil.emulator.truth.config import Date, Strict, UserPath
+from starhil.emulator.truth.config import Date, ProfilePath, Strict, UserPath
 
 FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
 """Duration of one stage of a frame, seconds."""
@@ -37,7 +37,7 @@ class RunConfig(Strict):
     worker: Literal["process", "thread", "error_model"] = "process"
     """Whether frames are rendered and solved in a worker process or in a thread of the emulator, or replaced by an
     error model: attitudes are the truth with noise, and there are no images of the sky."""
-    state_dir: UserPath = ""
+    state_dir: ProfilePath = ""
     """Folder for state that survives a restart: saved parameters, boot count, CANopen settings. Empty: no
     state is kept."""
     start_unix_s: Date = 1_767_225_600.0
@@ -47,7 +47,7 @@ class RunConfig(Strict):
 class CatalogConfig(Strict):
     """The star catalogue."""
 
-    path: UserPath = ""
+    path: ProfilePath = ""
     """Hipparcos file; empty: the installed catalogue."""
     epoch: Annotated[float, Field(ge=1900.0, le=2200.0)] | None = None
     """Julian year of the star positions; default: that of the date at the start of the run, to a tenth."""
@@ -183,13 +183,13 @@ class RadiationConfig(Strict):
 class ImagesConfig(Strict):
     """Source of images instead of rendering; `[camera]` then describes the camera of the images."""
 
-    folder: UserPath = ""
+    folder: ProfilePath = ""
     """Folder of PNG, TIFF, JPEG or BMP images, used in the order of their names; relative to the profile."""
     capture: Annotated[int, Field(ge=0, le=99)] | str = ""
     """Number of a camera (0 is the first), or a video file, as in OpenCV's `VideoCapture`."""
     repeat: bool = True
     """Whether to start again after the last image in the folder."""
-    dark: UserPath = ""
+    dark: ProfilePath = ""
     """Dark image of the same camera and exposure, which is subtracted from each image."""
 
     @model_validator(mode="after")

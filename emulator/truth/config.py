@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self, TypeAlias
+from typing import Annotated, Any, Final, Literal, Self, TypeAlias, get_args
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -56,6 +56,30 @@ def _expanded(path: str) -> str:
 
 UserPath: TypeAlias = Annotated[str, AfterValidator(_expanded)]
 """A path as a user writes it, which may begin with `~`; expanded when it is read."""
+
+
+class OfProfile:
+    """Marks a path that refers to the folder of the profile which has it."""
+
+
+ProfilePath: TypeAlias = Annotated[UserPath, OfProfile()]
+"""A path of a user that refers to the folder of the profile which has it."""
+
+
+def path_keys(model: type[BaseModel]) -> list[str]:
+    """Return the keys of a model that are a `ProfilePath`."""
+    return [
+        name
+        for name, field in model.model_fields.items()
+        if any(isinstance(mark, OfProfile) for mark in field.metadata)
+    ]
+
+
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models in an annotation."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for inner in get_args(annotation) for model in models_in(inner)]
 
 
 class Strict(BaseModel):
@@ -271,7 +295,7 @@ class FileConfig(SourceConfig):
     """A file of attitudes: CSV, CCSDS AEM, STK `.a` or SPICE; a relative path refers to the profile's folder."""
 
     kind: Literal["file"]
-    path: UserPath
+    path: ProfilePath
     """The file; its content says which format it has, see truth-files.md."""
     start: Literal["run", "now"] = "run"
     """Time zero of the file, which is the first useable date of a file with dates: the start of the run, or the time at
@@ -457,7 +481,7 @@ class OrbitFileConfig(Strict):
 
     kind: Literal["file"]
     """Selects this form of the orbit."""
-    path: UserPath
+    path: ProfilePath
     """The file, see truth-files.md."""
 
     def build(self, start_unix_s: float, folder: Path) -> Orbit:  # noqa: ARG002 (one signature for all)
