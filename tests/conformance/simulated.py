@@ -54,9 +54,11 @@ class LoopClock:
 
     name = "real"
     speed = 1.0
+    stepped = None
 
     def __init__(self, loop: SimulatedLoop) -> None:
         self._loop = loop
+        self.running = self
 
     def now_ns(self) -> int:
         return round(self._loop.time() * NANOSECONDS)
