@@ -28,6 +28,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
+from starhil.emulator.truth.config import models_in
+
 ROOT: Final = Path(__file__).resolve().parent.parent
 DOCS: Final = ROOT / "docs"
 
@@ -207,13 +209,6 @@ def default(field: FieldInfo, schema: Mapping[str, Any] | None = None) -> str:
     return "" if field.default is PydanticUndefined else literal(field.default)
 
 
-def models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models in an annotation."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [model for inner in get_args(annotation) for model in models_in(inner)]
-
-
 # --- the tables ---
 
 
@@ -366,14 +361,13 @@ def accepted_options(algorithm: str) -> list[str]:
 
 def faults() -> str:
     """Keys of the tables of a `fault` request, except optical faults, whose keys are those of `[sky]`."""
-    from starhil.emulator.run.faults import DeviceFault, WireFault
+    from starhil.emulator.run.faults import EFFECTS, DeviceFault, WireFault
     from starhil.protocol.unit import load_unit
 
     enums = load_unit().enums
     rows = []
-    for row in model_rows(DeviceFault):
-        enum = enums.get({"`error`": "device_error", "`reset`": "reset_cause"}.get(row[0], ""))
-        allowed = row[2] if enum is None else ", ".join(f"`{name}`" for name in enum.values)
+    for row, effect in zip(model_rows(DeviceFault), EFFECTS.values(), strict=True):
+        allowed = ", ".join(f"`{name}`" for name in enums[effect.enum].values) if effect.enum else row[2]
         rows.append((row[0], row[1], allowed, row[3], row[4]))
     return (
         f"### `device`\n\n{table(rows)}\n\n### `serial`, `can`\n\n"

@@ -21,6 +21,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+import starid
 from starhil.emulator.benchmarks.hard_sky import FASTEST_DEG_S, HARD_SENSOR, hard_sky
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.model import SensorModel
@@ -110,8 +111,6 @@ class CampaignPlan:
 
 def made_by() -> dict[str, str]:
     """Return the versions of everything that affects a result: starhil, sources, catalogue and libraries."""
-    import starid
-
     emulator = Path(__file__).parent.parent
     rooms = ("sensor", "benchmarks")
     roots = (Path(starid.__file__).parent, *(emulator / room for room in rooms))

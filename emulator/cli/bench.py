@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -220,8 +221,6 @@ def bus(
     status is 0 only if nothing was lost or wrong and the 99th percentile of the CAN reply latency is within
     the limit.
     """
-    from contextlib import nullcontext
-
     from starhil.emulator.cli.bench_bus import check_rows, measure, print_figures, started_device
     from starhil.hil_tests.timing.realtime import set_realtime_priority
     from starhil.protocol.unit import load_unit

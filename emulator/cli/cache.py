@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import time
+from dataclasses import replace
 
 import typer
 
@@ -56,8 +57,6 @@ def warm(
     Progress is shown on stderr. Kernels are the same for all profiles; the star index depends on the camera and the
     parameters.
     """
-    from dataclasses import replace
-
     from starhil.emulator.device.device import adopt_camera, profile_defaults
     from starhil.emulator.device.parameters import Parameters
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile

@@ -21,6 +21,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import Jobs, names_of
+from starhil.protocol.files.bundled import bundled_units
 from starid.cli.options import AsJson
 
 IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made there)
@@ -58,8 +59,6 @@ class PlanOptions:
 
     def plan(self) -> Iterator[tuple[str, int, int, str]]:
         """Generate unit, seed, steps and kind of each life; a kind has a period, in which its last life is of it."""
-        from starhil.protocol.files.bundled import bundled_units
-
         units = self.unit or sorted(bundled_units())
         kinds = {"rendered": (self.rendered, RENDERED_STEPS), "long": (self.long, LONG_STEPS)}
         kinds["usual"] = (1, self.steps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -23,7 +24,6 @@ def command(
     with --can socketcand:HOST:PORT/vcan0; `starhil docs walkthrough` shows the protocol. SIGINT or SIGTERM ends the hub.
     """
     import asyncio
-    import signal
 
     from starhil.emulator.simulation.guard import log_loop_errors_once
     from starhil.protocol.transports.hub import DEFAULT_BUS, CanHub

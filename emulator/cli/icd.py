@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -10,6 +11,7 @@ import typer
 
 from starhil.emulator.cli.options import Unit
 from starhil.emulator.cli.output import print_text, writing
+from starhil.emulator.errors import EmulatorError
 from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starid.cli.options import AsJson
 from starid.cli.output import output_help
@@ -57,7 +59,6 @@ def export(
     markdown and html are for readers, dbc for CAN tools, eds for CANopen masters, xtce, cosmos
     and cosmos-plugin for ground software, c for flight software.
     """
-    from starhil.emulator.errors import EmulatorError
     from starhil.protocol import export as formats
     from starhil.protocol.unit import load_unit
 
@@ -86,8 +87,6 @@ def _write(path: Path, text: str) -> None:
 @group.command("list")
 def list_rows(unit: Unit = DEFAULT_UNIT, as_json: AsJson = False) -> None:
     """List telecommands, telemetry and parameters, one per line."""
-    import json
-
     from starhil.protocol.unit import load_unit
 
     definition = load_unit(unit)

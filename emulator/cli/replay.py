@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Annotated
 
@@ -31,10 +32,10 @@ def command(
     and 2 if the recording cannot be played.
     """
     import asyncio
-    import json
 
     from starhil.emulator.errors import EmulatorError
     from starhil.emulator.launch.replay import replay
+    from starhil.emulator.links.table import LINKS
     from starhil.emulator.profile import load_profile
 
     if overrides and profile is None:
@@ -44,8 +45,7 @@ def command(
     if as_json:
         print(json.dumps(dataclasses.asdict(report)))
     else:
-        units = {"serial": "bytes"}
         for link, count in report.sent.items():
-            print(f"{link}: {count} {units.get(link, 'frames')} sent")
+            print(f"{link}: {count} {'bytes' if LINKS[link].carries is bytes else 'frames'} sent")
         print(f"{report.entries} entries played: {'; '.join(report.differences) or 'identical'}")
     return 1 if report.differences else 0

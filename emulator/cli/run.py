@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+import logging
+import signal
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
@@ -19,7 +22,9 @@ from starhil.emulator.cli.options import (
     names_of,
 )
 from starhil.emulator.cli.output import report_slow_start
+from starhil.emulator.console.recorders import RECORDERS
 from starhil.emulator.errors import EmulatorError
+from starhil.protocol.files.bundled import bundled_units, find_unit
 from starid.cli.output import output_help, prepare_output
 
 if TYPE_CHECKING:
@@ -28,18 +33,45 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class DeviceOptions:
-    """What replaces keys of the profile of every head."""
+class Key:
+    """The key of the profile that an option replaces."""
 
-    unit: UnitChoice = None
+    name: str
+    value: Callable[[Any, int], Any] = lambda value, _number: value
+    """Returns the value of the key for the nth head; folders and links differ by head."""
+
+
+def _state_dir(folder: Path, number: int) -> str:
+    own_folder = "" if number == 1 else f"head-{number}"  # in the folder of the first
+    return str(folder.resolve() / own_folder)
+
+
+def _symlink(path: Path, number: int) -> str:
+    from starhil.emulator.launch import path_of_head
+
+    return str(path_of_head(path.absolute(), number))
+
+
+def _absolute_folder(unit: str, _number: int) -> str:
+    """Return a folder from the command line as an absolute path; a profile would resolve it differently."""
+    return unit if unit in bundled_units() else str(find_unit(unit).absolute())
+
+
+@dataclass(frozen=True)
+class DeviceOptions:
+    """What replaces keys of the profile of every head; an option that names no key changes nothing."""
+
+    unit: Annotated[UnitChoice, Key("unit", _absolute_folder)] = None
     serial: Annotated[
         str | None,
+        Key("links.serial.port"),
         typer.Option(
             help="Serial link: auto (a pty), a device path, listen://HOST:PORT, or off. Default: the profile's (auto)."
         ),
     ] = None
     dialect: Annotated[
         str | None,
+        Key("links.serial.dialect"),
         typer.Option(
             help="Format of serial replies: a for OBC software written for the CubeComputer (replies begin with the "
             "row ID), b for a stand-alone node (no ID), c for generation 2. With the wrong dialect, values are shifted by "
@@ -48,19 +80,24 @@ class DeviceOptions:
     ] = None
     can: Annotated[
         str | None,
+        Key("links.can.channel"),
         typer.Option(
             help="CAN link: auto (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a channel, or off. Default: the profile's (auto)."
         ),
     ] = None
     canopen: Annotated[
         int | None,
+        Key("links.canopen.node"),
         typer.Option(
             min=0, max=127, help="Also run a CANopen node with this ID; 0: off. Default: the profile's (0)."
         ),
     ] = None
-    seed: Annotated[int | None, typer.Option(help="Random seed. Default: the profile's (1).")] = None
+    seed: Annotated[
+        int | None, Key("run.seed"), typer.Option(help="Random seed. Default: the profile's (1).")
+    ] = None
     clock: Annotated[
         str | None,
+        Key("run.clock"),
         typer.Option(
             help="Simulation clock: real, scaled:FACTOR, or stepped (advances only on request, for repeatable runs). "
             "Default: the profile's (real)."
@@ -68,34 +105,28 @@ class DeviceOptions:
     ] = None
     state_dir: Annotated[
         Path | None,
+        Key("run.state_dir", _state_dir),
         typer.Option(
             help="Folder for state that survives restarts, such as saved parameters. Default: no state is kept."
         ),
     ] = None
-    symlink: Annotated[Path | None, typer.Option(help="Symbolic link to the pty; removed at the end.")] = None
+    symlink: Annotated[
+        Path | None,
+        Key("links.serial.symlink", _symlink),
+        typer.Option(help="Symbolic link to the pty; removed at the end."),
+    ] = None
     settings: Settings = None
 
     def profile(self, name: str, number: int) -> Profile:
-        """Load the profile of the nth head, with the options in place of its keys; folders and links differ by head."""
-        from starhil.emulator.launch import path_of_head
+        """Load the profile of the nth head, with the options in place of its keys."""
         from starhil.emulator.profile import load_profile
 
-        state_dir, symlink = self.state_dir, self.symlink
-        own_folder = "" if number == 1 else f"head-{number}"  # in the folder of the first
-        values = {
-            "unit": None if self.unit is None else _absolute_folder(self.unit),
-            "links.serial.port": self.serial,
-            "links.serial.dialect": self.dialect,
-            "links.can.channel": self.can,
-            "links.canopen.node": self.canopen,
-            "run.clock": self.clock,
-            "run.seed": self.seed,
-            "run.state_dir": None if state_dir is None else str(state_dir.resolve() / own_folder),
-            "links.serial.symlink": None
-            if symlink is None
-            else str(path_of_head(symlink.absolute(), number)),
-        }
-        overrides = [f"{key}={_as_toml(value)}" for key, value in values.items() if value is not None]
+        overrides = [
+            f"{key.name}={_as_toml(key.value(value, number))}"
+            for option, hint in get_type_hints(type(self), include_extras=True).items()
+            for key in get_args(hint)
+            if isinstance(key, Key) and (value := getattr(self, option)) is not None
+        ]
         return load_profile(name, [*(self.settings or ()), *overrides])
 
 
@@ -149,8 +180,9 @@ class AroundOptions:
     record: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Record to a folder (for `starhil replay`) or to FILE.mcap (for Foxglove). Missing folders are created. "
-            "Repeatable."
+            help="Record to a folder (for `starhil replay`)"
+            + "".join(f" or to FILE{suffix} ({kind.use})" for suffix, kind in RECORDERS.items())
+            + ". Missing folders are created. Repeatable."
         ),
     ] = None
 
@@ -158,15 +190,17 @@ class AroundOptions:
         """Return the options of the run; the folders of its files are created."""
         from starhil.emulator.cli.console_client import ConsoleClient
         from starhil.emulator.control.token import check_token
-        from starhil.emulator.launch import RunOptions
+        from starhil.emulator.launch import ConsoleOptions, RunOptions
 
         for option, token in (("--control-token", self.control_token), ("--view-token", self.view_token)):
             if token is not None:
                 check_token(option, token)
         if self.view_token is not None and self.view == "off":
             raise EmulatorError("--view-token: needs --view")
-        folder, mcap = (_one_path(self.record, mcap=mcap) for mcap in (False, True))
-        for path, option in ((self.truth_log, "--truth-log"), (mcap, "--record")):
+        records = _by_format(self.record or ())
+        folder = records.pop("", None)
+        files = tuple(records.values())
+        for path, option in ((self.truth_log, "--truth-log"), *((file, "--record") for file in files)):
             if path is not None:
                 prepare_output(path, option)
         return RunOptions(
@@ -176,10 +210,9 @@ class AroundOptions:
             control_token=self.control_token or "",
             scenario=self.scenario,
             record=folder,
-            view=self.view,
-            view_token=self.view_token or "",
-            mcap=mcap,
-            make_client=ConsoleClient,
+            console=None
+            if self.view == "off" and not files
+            else ConsoleOptions(ConsoleClient, self.view, self.view_token or "", files),
         )
 
 
@@ -210,10 +243,8 @@ def command(
 
     worker = take_worker()  # first, to start up in parallel with the imports below
 
-    import asyncio
-    import logging
-
     from starhil.emulator.launch import Emulator, with_own_seeds
+    from starhil.emulator.links.table import LINKS
     from starhil.emulator.profile import DEFAULT_PROFILE
 
     levels = ("debug", "info", "warning", "error")
@@ -227,8 +258,9 @@ def command(
         )
     names = head or [profile or DEFAULT_PROFILE]
     profiles = with_own_seeds([device.profile(name, number) for number, name in enumerate(names, start=1)])
-    links = [each.links for each in profiles]
-    reachable = any((on.serial.port, on.can.channel, on.canopen.node) != ("off", "off", 0) for on in links)
+    reachable = any(
+        kind.setting(each.links) not in ("off", 0) for each in profiles for kind in LINKS.values()
+    )
     observed = around.truth_log or around.record or (around.control, around.view) != ("off", "off")
     if not reachable and not observed:
         raise EmulatorError(
@@ -241,9 +273,7 @@ def command(
 
 async def _serve(make: Callable[[], Emulator]) -> int:
     """Run an emulator, made in the event loop, until a signal or the control channel ends it; return the exit status."""
-    import asyncio
     import gc
-    import signal
 
     from starhil.emulator.simulation.guard import log_loop_errors_once
 
@@ -274,20 +304,16 @@ async def _serve(make: Callable[[], Emulator]) -> int:
     return int(emulator.failed)
 
 
-def _absolute_folder(unit: str) -> str:
-    """Return a folder from the command line as an absolute path; a profile would resolve it differently."""
-    from starhil.protocol.files.bundled import bundled_units, find_unit
-
-    return unit if unit in bundled_units() else str(find_unit(unit).absolute())
-
-
-def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
-    """Return the MCAP file of `--record`, or its folder; None without the option."""
-    found = [path for path in paths or () if (path.suffix == ".mcap") == mcap]
-    if len(found) > 1:
-        kind = "MCAP file" if mcap else "folder"
-        raise EmulatorError(f"--record {found[1]}: one {kind} per run, and {found[0]} is one already")
-    return found[0] if found else None
+def _by_format(paths: Sequence[Path]) -> dict[str, Path]:
+    """Return the files of `--record` by suffix, and the folder by the empty suffix."""
+    found: dict[str, Path] = {}
+    for path in paths:
+        suffix = path.suffix if path.suffix in RECORDERS else ""
+        other = found.setdefault(suffix, path)
+        if other is not path:
+            kind = f"{suffix[1:].upper()} file" if suffix else "folder"
+            raise EmulatorError(f"--record {path}: one {kind} per run, and {other} is one already")
+    return found
 
 
 def _as_toml(value: str | float) -> str:

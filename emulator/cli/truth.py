@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from starhil.emulator.cli.output import writing
+from starhil.emulator.errors import EmulatorError
 from starid.cli.output import output_help
 
 group = typer.Typer(help="Convert true and measured attitudes to standard files.", no_args_is_help=True)
@@ -52,9 +54,6 @@ def convert(
     ] = -999_000,
 ) -> None:
     """Write attitudes as a CCSDS AEM or a SPICE CK."""
-    from dataclasses import replace
-
-    from starhil.emulator.errors import EmulatorError
     from starhil.emulator.truth.ccsds_file import write_aem
     from starhil.emulator.truth.csv_file import read_log
     from starhil.emulator.truth.file import read_truth_file

@@ -10,7 +10,8 @@ import typer
 
 from starhil.emulator.cli.options import names_of
 from starhil.emulator.cli.output import print_text
-from starhil.protocol.files.bundled import DEFAULT_UNIT
+from starhil.emulator.errors import EmulatorError, explained
+from starhil.protocol.files.bundled import DEFAULT_UNIT, SKELETON, bundled_units
 from starid.cli.options import AsJson
 
 group = typer.Typer(
@@ -35,7 +36,6 @@ UnitArgument = Annotated[
 @group.command("list")
 def list_units(as_json: AsJson = False) -> None:
     """List the bundled units."""
-    from starhil.protocol.files.bundled import bundled_units
     from starhil.protocol.unit import load_unit
 
     units = {name: load_unit(name) for name in bundled_units()}
@@ -64,8 +64,6 @@ def new(
     ],
 ) -> None:
     """Create a unit: a commented definition that already runs, as a starting point."""
-    from starhil.emulator.errors import EmulatorError, explained
-    from starhil.protocol.files.bundled import SKELETON
     from starid.storage.files import write_atomically
 
     if folder.exists() and (not folder.is_dir() or any(folder.glob("*.toml"))):

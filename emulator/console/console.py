@@ -13,6 +13,7 @@ from typing import Any, Final
 from starhil.emulator.console.describe import describe, load_bright_stars
 from starhil.emulator.console.history import History, frame_message, json_row
 from starhil.emulator.console.obc import POLL_S, ConsoleObc, Exchange, ObcConnection
+from starhil.emulator.console.obc_link import obc_bus
 from starhil.emulator.console.pointing import pointing_request
 from starhil.emulator.console.reported_runs import ReportedRuns
 from starhil.emulator.console.stepping import StepRunner
@@ -21,6 +22,7 @@ from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.table import LINKS
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.emulator.run import Run
 from starhil.emulator.run.head import Head
@@ -36,8 +38,6 @@ TURN_S: Final = 0.1
 
 STATUS_S: Final = 0.5
 """Interval at which the status of the run is reported, seconds."""
-
-LINK_NAMES: Final = {"serial": "serial", "can": "CAN"}
 
 CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "clear_faults", "scenario"})
 """Requests on the control channel that a page may make."""
@@ -63,11 +63,13 @@ class Console:
             device.icd,
             head.traffic,
             head.serial_dialect,
-            lambda: next((link.transport.description for link in head.links if link.bus == "can"), ""),
+            lambda: next(
+                (link.transport.description for link in head.links.values() if link.bus == "can"), ""
+            ),
         )
         self.stepping = stepping
         self._requests = RequestEncoder(device.icd)
-        self._address = "canopen_node" if device.icd.canopen_only else "can_address"
+        self._address = LINKS[obc_bus(device.icd)].address
         self._last_frame = b""
         """The latest message with an image; empty before the first."""
         self._unresponsive_since_s: float | None = None
@@ -268,11 +270,11 @@ class Console:
         now_s = asyncio.get_running_loop().time()
         return [
             {
-                "link": "CANopen" if link is self._head.canopen else LINK_NAMES[link.bus],
+                "link": LINKS[name].title,
                 "requests": link.heard.requests,
                 "age_s": None if link.heard.last_s is None else round(now_s - link.heard.last_s, 1),
             }
-            for link in self._head.links
+            for name, link in self._head.links.items()
         ]
 
     async def _poll_telemetry(self) -> None:
@@ -349,7 +351,7 @@ class Console:
 
     async def _encode(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         row, data, _, problem = self.obc.encode(str(request.get("row")), _table(request, "values"))
-        address = int(self._head.device.parameters[self._address])
+        address = int(self._head.device.parameters[self._address]) if self._address else 0
         return {"problem": problem, **self._requests.encode(row, data, CONSOLE_ADDRESS, address)}
 
     async def _parameters(self, _viewer: Viewer, _request: dict[str, Any]) -> dict[str, Any]:

@@ -11,9 +11,10 @@ import numpy as np
 
 from starhil.emulator.console.history import COLUMNS, KEPT_ROWS, MODES
 from starhil.emulator.console.pointing import DEFAULT_RATE_DEG_S
+from starhil.emulator.links.table import BUSES, LINKS
 from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.run import Run
-from starhil.emulator.run.faults import NO_ERROR, DeviceFault
+from starhil.emulator.run.faults import EFFECTS, DeviceFault
 from starhil.emulator.run.head import Head
 from starhil.emulator.sensor.sky.objects import SkyObjects
 from starhil.protocol.files.bundled import bundled
@@ -36,7 +37,7 @@ def load_bright_stars(path: str | None, epoch: float) -> dict[str, Any]:
 def describe(run: Run, head: Head) -> dict[str, Any]:
     """Return the description of a head of a run as JSON data."""
     icd = head.icd
-    links = {key: head.ready_fields[key] for key in ("serial", "can", "canopen") if key in head.ready_fields}
+    links = {key: head.ready_fields[key] for key in LINKS if key in head.ready_fields}
     return {
         "head": head.number,
         "heads": [f"{each.number}: {each.profile.name}" for each in run.heads],
@@ -47,6 +48,7 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
         "seed": head.profile.run.seed,
         "clock": run.clock.name,
         "links": links,
+        "buses": BUSES,
         "camera": head.warm.camera if head.warm is not None else head.profile.camera.values(),
         "unit": {"name": icd.name, "version": icd.version},
         "telecommands": [describe_row(row, icd) for row in icd.rows if row.kind == "telecommand"],
@@ -55,7 +57,7 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
             {"id": item.id, "name": item.name, "unit": item.unit, "min": item.minimum, "max": item.maximum}
             for item in icd.parameters.values()
         ],
-        "faults": fault_controls(icd, [link.bus for link in head.links]),
+        "faults": fault_controls(icd, [link.bus for link in head.links.values()]),
         "scenarios": list(bundled("scenario")),
         "slew_rate_deg_s": DEFAULT_RATE_DEG_S,
     }
@@ -96,17 +98,16 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
 def fault_controls(icd: InterfaceDefinition, buses: list[str]) -> list[dict[str, Any]]:
     """Return the controls for faults by level: name, kind and range of each value."""
     choices = {
-        "error": [name for name, code in icd.enum("device_error").values.items() if code != NO_ERROR],
-        "reset": list(icd.enum("reset_cause").values),
+        **{key: effect.names(icd) for key, effect in EFFECTS.items() if effect.enum},
         "parameter": list(icd.device_parameters),
     }
     share = {"name": "blocked_share", "kind": "number", "min": 0.0, "max": 1.0, "default": 0.0}
     levels = [
-        {"level": "optical", "controls": [share, *_class_controls(SkyObjects)]},
-        {"level": "device", "controls": _model_controls(DeviceFault, choices)},
+        {"level": "optical", "title": "sky and optics", "controls": [share, *_class_controls(SkyObjects)]},
+        {"level": "device", "title": "device", "controls": _model_controls(DeviceFault, choices)},
     ]
     wire = _model_controls(WireFault, choices)
-    return levels + [{"level": bus, "controls": wire} for bus in dict.fromkeys(buses)]
+    return levels + [{"level": bus, "title": BUSES[bus], "controls": wire} for bus in dict.fromkeys(buses)]
 
 
 def _model_controls(

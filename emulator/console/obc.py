@@ -8,16 +8,15 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Protocol
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.table import LinkName
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd import FieldError, InterfaceDefinition
 from starhil.protocol.icd.codec import Field, Row
 from starhil.protocol.icd.values import Value
 from starhil.protocol.serial.cubespace import Dialect
-
-Bus = Literal["can", "canopen", "serial"]
 
 KEPT_STEPS: Final = 1000
 """Number of latest transactions that can be saved as a session."""
@@ -70,7 +69,7 @@ class ObcPort:
     Attributes
     ----------
     bus
-        `can`, `canopen` or `serial`.
+        Link on which it talks to the device.
     icd
         Interface definition of the device.
     device_address
@@ -79,7 +78,7 @@ class ObcPort:
         Returns the current dialect of serial replies; None for a unit without dialects.
     """
 
-    bus: Bus
+    bus: LinkName
     where: str
     icd: InterfaceDefinition
     device_address: Callable[[], int]

@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 
-from starhil.emulator.console.obc import Bus, MakeClient, ObcConnection, ObcPort
+from starhil.emulator.console.obc import MakeClient, ObcConnection, ObcPort
 from starhil.emulator.links.base import AnyLink
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
+from starhil.emulator.links.table import LINKS, LinkName
 from starhil.emulator.run.head import Head
 from starhil.protocol.icd import InterfaceDefinition
 
@@ -24,11 +25,12 @@ async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[
     icd, parameters = head.icd, head.device.parameters
     separate: AnyLink | None = None
     where, bus = "", obc_bus(icd)
+    address = LINKS[bus].address
     if bus == "serial":
         from starhil.protocol.transports.serial import open_serial
 
         separate = SerialLink(head.requests, open_serial("auto", paced=False), console=True)
-    elif head.canopen if icd.canopen_only else head.can:
+    elif bus in head.links:
         where = head.ready_fields["can"]
     else:
         separate = _open_virtual_bus(head)
@@ -40,8 +42,8 @@ async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[
             bus,
             where,
             icd,
-            device_address=lambda: int(parameters["canopen_node" if bus == "canopen" else "can_address"]),
-            dialect=lambda: separate.dialect if isinstance(separate, SerialLink) else None,
+            device_address=lambda: int(parameters[address]) if address else 0,
+            dialect=lambda: None if separate is None else separate.dialect,
         )
     )
     closers.append(client.close)
@@ -61,7 +63,7 @@ def _open_virtual_bus(head: Head) -> AnyLink:
     return CanopenLink(head.requests, transport)
 
 
-def obc_bus(icd: InterfaceDefinition) -> Bus:
+def obc_bus(icd: InterfaceDefinition) -> LinkName:
     """Return the bus on which an OBC talks to a unit."""
     if icd.canopen_only:
         return "canopen"

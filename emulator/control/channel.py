@@ -172,8 +172,7 @@ class ControlServer:
             head = self._head(request)
             if known is not None:
                 _check_keys(request, known)
-            if self._run.recorder is not None:
-                self._run.recorder.latch()
+            self._run.wiring.latch()
             return {"ok": True, **await action(head, request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {"ok": False, "error": str(error)}
@@ -269,17 +268,17 @@ class ControlServer:
     async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
         wanted = await _parse(FaultRequest, request)
         head.faults.check(wanted)
-        self._run.record(NewFaults, request=wanted)
+        self._run.wiring.enter(NewFaults, request=wanted)
         head.faults.inject(wanted)
         return {"faults": head.faults.describe()}
 
     async def _clear_faults(self, head: Head, _request: dict[str, Any]) -> Answer:
-        self._run.record(ClearedFaults)
+        self._run.wiring.enter(ClearedFaults)
         head.faults.clear()
         return {"faults": head.faults.describe()}
 
     async def _run_scenario(self, head: Head, request: dict[str, Any]) -> Answer:
-        if self._run.recorder is not None:
+        if self._run.wiring.records:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         name, start_s = str(request.get("name", "")), self._run.clock.now_ns() / NANOSECONDS
         events = await asyncio.to_thread(lambda: load_scenario(name).prepare(head, self._run.truth, start_s))

@@ -37,11 +37,10 @@ class Mode(StrEnum):
         return self in {Mode.LOST_IN_SPACE, Mode.TRACKING}
 
 
+_RUNNING: Final = frozenset(Mode) - {Mode.BOOT, Mode.ERROR}
 COMMANDED: Final[dict[Mode, frozenset[Mode]]] = {
+    **dict.fromkeys(_RUNNING, _RUNNING),
     Mode.BOOT: frozenset(),
-    Mode.STANDBY: frozenset({Mode.STANDBY, Mode.LOST_IN_SPACE, Mode.TRACKING}),
-    Mode.LOST_IN_SPACE: frozenset({Mode.STANDBY, Mode.LOST_IN_SPACE, Mode.TRACKING}),
-    Mode.TRACKING: frozenset({Mode.STANDBY, Mode.LOST_IN_SPACE, Mode.TRACKING}),
     Mode.ERROR: frozenset({Mode.STANDBY}),
 }
 """Mode → modes that can be commanded from it (docs/rules.md, R13)."""

@@ -1,5 +1,11 @@
 """The ways to start a run: for a user, from a recording, in memory."""
 
-from starhil.emulator.launch.emulator import Emulator, RunOptions, path_of_head, with_own_seeds
+from starhil.emulator.launch.emulator import (
+    ConsoleOptions,
+    Emulator,
+    RunOptions,
+    path_of_head,
+    with_own_seeds,
+)
 
-__all__ = ["Emulator", "RunOptions", "path_of_head", "with_own_seeds"]
+__all__ = ["ConsoleOptions", "Emulator", "RunOptions", "path_of_head", "with_own_seeds"]

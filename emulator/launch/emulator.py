@@ -9,9 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from starhil.emulator.console.obc import MakeClient
+from starhil.emulator.console.recorders import RECORDERS
 from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.table import LINKS
 from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
 from starhil.emulator.run.recorder import TRUTH_FILE, Recorder
@@ -21,6 +23,20 @@ from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from starhil.emulator.simulation.clock import make_clock
 from starhil.emulator.simulation.guard import close_all
 from starhil.emulator.simulation.output_file import OutputFile
+
+
+@dataclass(frozen=True)
+class ConsoleOptions:
+    """Options of console and recorders, which use images and have an OBC on the bus of each head."""
+
+    make_client: MakeClient
+    """Makes the OBC."""
+    view: str = "off"
+    """Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT."""
+    view_token: str = ""
+    """Token of pages that may look but not command; empty for none."""
+    files: tuple[Path, ...] = ()
+    """Files of recorders (`RECORDERS`); each is one file per head (`path_of_head`)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,19 +55,8 @@ class RunOptions:
     """Name or path of a scenario; empty for none."""
     record: Path | None = None
     """Folder of a recording of the run, for a replay."""
-    view: str = "off"
-    """Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT."""
-    view_token: str = ""
-    """Token of pages that may look but not command; empty for none."""
-    mcap: Path | None = None
-    """MCAP file of images, truth, telemetry and events; one file per head (`path_of_head`)."""
-    make_client: MakeClient | None = None
-    """Makes the OBC for console and MCAP file; required for these."""
-
-    @property
-    def watched(self) -> bool:
-        """Whether a console or an MCAP file uses the images."""
-        return self.view != "off" or self.mcap is not None
+    console: ConsoleOptions | None = None
+    """Console and recorders; None for neither."""
 
 
 class Emulator:
@@ -69,18 +74,21 @@ class Emulator:
     ) -> None:
         check_heads(profiles)
         self.options = options = options or RunOptions()
+        self._recorder: Recorder | None = None
         if options.record is not None:
             if len(profiles) > 1:
                 raise EmulatorError("--record: records one head; run the others separately, or omit it")
-            wiring = Recorder(options.record, wiring or Wiring(make_clock(profiles[0].run.clock)))
-        self.run = Run(profiles, wiring, worker, previews=options.watched)
+            wiring = self._recorder = Recorder(
+                options.record, wiring or Wiring(make_clock(profiles[0].run.clock))
+            )
+        self.run = Run(profiles, wiring, worker, previews=options.console is not None)
         self.ended = asyncio.Event()
         """Set to end the run."""
         self.control: ControlServer | None = None
         self.ready_fields: dict[str, str] = {}
         """Addresses of control channel and console."""
         self._closers: list[Callable[[], object]] = []
-        """Closers of console and MCAP file, in the order of opening."""
+        """Closers of console and recorders, in the order of opening."""
         self._files: list[OutputFile] = []
         """Logs and recordings that the run writes."""
         self._rejected = False
@@ -107,11 +115,11 @@ class Emulator:
             raise
 
     async def _start(self, options: RunOptions, run: Run) -> None:
-        if run.recorder is not None:
+        if self._recorder is not None:
             from starhil.emulator.launch.recording import prepare_recording
 
-            prepare_recording(run.recorder.folder, run.profile, options.scenario)
-            self._files.append(run.recorder.open())
+            prepare_recording(self._recorder.folder, run.profile, options.scenario)
+            self._files.append(self._recorder.open())
         scenario = load_scenario(options.scenario) if options.scenario else None
         logs = self._open_logs()
         await run.open()
@@ -121,12 +129,12 @@ class Emulator:
             for head in run.heads:
                 events = scenario.prepare(head, run.truth if head.number == 1 else None)
                 head.device.scheduler.add(events)
-        if options.control != "off" or options.watched:
+        if options.control != "off" or options.console is not None:
             self.control = ControlServer(run, self.ended.set, options.control_token)
-        if self.control is not None and options.control != "off":
-            self.ready_fields["control"] = await self.control.start(options.control)
-        if self.control is not None and options.watched:
-            await self._open_console(self.control)
+            if options.control != "off":
+                self.ready_fields["control"] = await self.control.start(options.control)
+            if options.console is not None:
+                await self._open_console(options.console, self.control)
         run.begin()
 
     def _open_logs(self) -> list[tuple[int, TruthLog]]:
@@ -139,9 +147,9 @@ class Emulator:
                 path = path_of_head(options.truth_log, number)
                 logs.append((number, TruthLog(path, overwrite=options.overwrite, wall_times=wall_times)))
                 self._files.append(logs[-1][1].file)
-        if run.recorder is not None:
-            path = run.recorder.folder / TRUTH_FILE
-            logs.append((1, TruthLog(path, wall_times=wall_times, output=run.recorder.output)))
+        if self._recorder is not None:
+            path = self._recorder.folder / TRUTH_FILE
+            logs.append((1, TruthLog(path, wall_times=wall_times, output=self._recorder.output)))
             self._files.append(logs[-1][1].file)
         return logs
 
@@ -165,9 +173,9 @@ class Emulator:
         First of all, nothing more is received: closing takes many turns of the loop, which a storm of requests makes long.
         """
         for head in self.run.heads:
-            for link in head.links:
+            for link in head.links.values():
                 link.transport.stop_receiving()
-        recorder = self.run.recorder
+        recorder = self._recorder
         closers: list[Callable[[], object]] = [*reversed(self._closers), self.run.close]
         self._closers.clear()
         if self.control is not None:
@@ -179,24 +187,19 @@ class Emulator:
             closers.append(recorder.discard)
         await close_all(closers)
 
-    async def _open_console(self, control: ControlServer) -> None:
-        """Open console and MCAP files, with an OBC on the bus of each head."""
+    async def _open_console(self, options: ConsoleOptions, control: ControlServer) -> None:
+        """Open console and recorders, with an OBC on the bus of each head."""
         from starhil.emulator.console.obc_link import open_obc
 
-        if self.options.make_client is None:
-            raise EmulatorError("run: console and recording need make_client")
-        make_client = self.options.make_client
-        clients = [await open_obc(head, make_client, self._closers) for head in self.run.heads]
-        if self.options.mcap is not None:
-            from starhil.emulator.console.mcap import McapRecorder
-
+        clients = [await open_obc(head, options.make_client, self._closers) for head in self.run.heads]
+        for file in options.files:
             for head, client in zip(self.run.heads, clients, strict=True):
-                path = path_of_head(self.options.mcap, head.number)
-                recorder = McapRecorder(head, client, path, overwrite=self.options.overwrite)
+                path = path_of_head(file, head.number)
+                recorder = RECORDERS[file.suffix].make(head, client, path, self.options.overwrite)
                 self._closers.append(recorder.close)
                 self._files.append(recorder.file)
                 recorder.start()
-        if self.options.view != "off":
+        if options.view != "off":
             from starhil.emulator.console.console import Console
             from starhil.emulator.console.reported_runs import ReportedRuns
             from starhil.emulator.console.server import ConsoleServer
@@ -210,9 +213,9 @@ class Emulator:
                 self._closers.append(console.close)
                 console.start()
                 consoles.append(console)
-            server = ConsoleServer(consoles, self.options.view_token)
+            server = ConsoleServer(consoles, options.view_token)
             self._closers.append(server.close)
-            self.ready_fields |= await server.start(self.options.view)
+            self.ready_fields |= await server.start(options.view)
 
 
 def path_of_head(path: Path, number: int) -> Path:
@@ -243,11 +246,8 @@ def check_heads(profiles: Sequence[Profile]) -> None:
                 f"--head {profile.source}: run.clock is {profile.run.clock}, but {first.source} has "
                 f"{first.run.clock}; heads share a clock, give --clock"
             )
-        links = profile.links
         for key, bus, number in (
-            ("links.can.address", links.can.channel if links.can.channel != "off" else "", links.can.address),
-            ("links.canopen.node", links.can.channel if links.canopen.node else "", links.canopen.node),
-            ("links.serial.port", _fixed_port(links.serial.port), 0),
+            *(kind.exclusive(profile.links) for kind in LINKS.values()),
             ("run.state_dir", profile.run.state_dir and str(profile.folder / profile.run.state_dir), 0),
         ):
             if not bus:
@@ -258,8 +258,3 @@ def check_heads(profiles: Sequence[Profile]) -> None:
                 raise EmulatorError(
                     f"--head {profile.source}: {key} is {value}, as in {other.source}; change one of them"
                 )
-
-
-def _fixed_port(port: str) -> str:
-    """Return the port of a serial link if only one head can use it, otherwise an empty text."""
-    return "" if port in ("auto", "off") or port.endswith(":0") else port

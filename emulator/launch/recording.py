@@ -20,8 +20,8 @@ from starhil.emulator.run.recorder import (
     SCENARIO_FILE,
     STATE_FOLDER,
 )
+from starhil.protocol.files.user_file import read_user_text
 from starhil.protocol.files.validation import problems
-from starid.storage.files import read_text
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -108,7 +108,7 @@ def read_run(folder: Path) -> tuple[Profile, bool]:
 def read_recorded(path: Path) -> str:
     """Read a file of a recording; an error names it."""
     with explained(f"replay {path}: cannot be read", errors=(OSError, UnicodeDecodeError)):
-        text = read_text(path)
+        text = read_user_text(path)
     return text  # noqa: RET504 (mypy expects that the block may be left without a result)
 
 

@@ -54,11 +54,11 @@ from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.simulation.guard import call_guarded
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.files.user_file import open_user_file
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 from starid.errors import StaridError
-from starid.storage.files import open_regular
 
 Item = TypeVar("Item", bytes, CanFrame)
 
@@ -191,7 +191,7 @@ def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
     """Yield the entries of a tape, whose times do not decrease, each with file and line."""
     path = folder / EVENTS_FILE
     last_ns = 0
-    with explained(f"replay {path}: cannot be read"), open_regular(path) as file:
+    with explained(f"replay {path}: cannot be read"), open_user_file(path) as file:
         for number, line in enumerate(file, start=1):
             if not line.endswith(b"\n"):
                 return  # the run was killed while it wrote

@@ -13,8 +13,8 @@ from starhil.emulator.errors import explained
 from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
 from starhil.emulator.run.truth_log import WALL_TIMES
 from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.files.user_file import open_user_file
 from starhil.protocol.messages import Reply, ReplyKind
-from starid.storage.files import open_regular
 
 
 def difference_sent(
@@ -170,6 +170,6 @@ def difference_of_truth(recorded: Path, now: Path, *, to_the_end: bool) -> str:
 
 def _rows(path: Path) -> list[dict[str, str]]:
     unreadable = explained(f"replay {path}: cannot be read", errors=(OSError, UnicodeDecodeError, csv.Error))
-    with unreadable, TextIOWrapper(open_regular(path), encoding="utf-8", newline="") as file:
+    with unreadable, TextIOWrapper(open_user_file(path), encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     return rows  # noqa: RET504 (mypy expects that the block may be left without a result)

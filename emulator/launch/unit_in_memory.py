@@ -17,6 +17,7 @@ from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch.emulator import Emulator, RunOptions
 from starhil.emulator.launch.simulated_loop import WORKER_WAIT_S
+from starhil.emulator.links.table import LINKS
 from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
 from starhil.emulator.run.faults import FaultRequest
@@ -191,7 +192,9 @@ class UnitUnderTest:
         self._emulator = None
         port = MemorySerial("serial", self._time_s)
         buses: dict[str, MemoryTransport[CanFrame]] = {
-            name: MemoryTransport(f"virtual:{name}", self._time_s) for name in ("can", "canopen")
+            name: MemoryTransport(f"virtual:{name}", self._time_s)
+            for name, kind in LINKS.items()
+            if kind.carries is CanFrame
         }
         self._transports = {"serial": port, **buses}
         for name, transport in self._transports.items():
@@ -262,12 +265,12 @@ class UnitUnderTest:
     def fault(self, fault: Mapping[str, Any]) -> None:
         """Inject faults, a request as on the control channel."""
         request = FaultRequest.model_validate(dict(fault))
-        self.run.record(NewFaults, request=request)
+        self.run.wiring.enter(NewFaults, request=request)
         self.head.faults.inject(request)
 
     def clear_faults(self) -> None:
         """End all faults."""
-        self.run.record(ClearedFaults)
+        self.run.wiring.enter(ClearedFaults)
         self.head.faults.clear()
 
     async def end_pipeline(self) -> None:
@@ -331,6 +334,4 @@ class UnitUnderTest:
 
 def links_of(icd: InterfaceDefinition) -> tuple[str, ...]:
     """Return the names of a unit's links."""
-    there = {"serial": icd.link.serial is not None, "can": icd.link.can is not None}
-    there["canopen"] = icd.canopen is not None
-    return tuple(name for name, present in there.items() if present)
+    return tuple(name for name, kind in LINKS.items() if kind.is_of(icd))

@@ -18,6 +18,7 @@ from starhil.emulator.simulation.scheduler import Event
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.messages import DEFAULT_TIMEOUT_S, ErrorCode, LinkFault, Receiver, Reply, Request
+from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.transports.base import Transport
 
 Item = TypeVar("Item")
@@ -66,6 +67,16 @@ class Link(ABC, Generic[Item]):
         """Open the transport; return its description: a port or bus."""
         await self.transport.start(self._receive, self._log_transport_error)
         return self.transport.description
+
+    @property
+    def dialect(self) -> Dialect | None:
+        """The current format of replies, on a line whose unit has dialects."""
+        return None
+
+    @property
+    def ready_fields(self) -> dict[str, str]:
+        """Fields of the ready line, once the transport is open."""
+        return {self.bus: self.transport.description}
 
     async def close(self) -> None:
         """Close the transport."""

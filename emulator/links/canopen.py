@@ -227,6 +227,11 @@ class CanopenLink(Link[CanFrame]):
         self._run_action(self.slave.start)
         return bus
 
+    @property
+    def ready_fields(self) -> dict[str, str]:
+        """Fields of the ready line."""
+        return super().ready_fields | {"canopen": str(self._wanted_node)}
+
     async def close(self) -> None:
         """Leave the bus."""
         self._node.release()

@@ -89,6 +89,12 @@ class SerialLink(RequestLink[bytes, SerialStyle]):
             dialect = Dialect(str(parameters["serial_dialect"]))
         return SerialStyle(dialect, int(parameters["serial_baud"]))
 
+    @property
+    def ready_fields(self) -> dict[str, str]:
+        """Fields of the ready line, with the dialect at the start."""
+        dialect = {} if self.dialect is None else {"dialect": self.dialect.value}
+        return super().ready_fields | dialect
+
     def _style_changed(self, before: SerialStyle) -> None:
         if self._style.baud != before.baud:
             self._port.set_baud(self._style.baud)

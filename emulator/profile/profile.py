@@ -42,6 +42,7 @@ from starhil.protocol.files.user_file import TomlError, parse_toml
 from starhil.protocol.files.validation import problems
 from starhil.protocol.unit import load_unit
 from starid.catalog.earth import unix_time
+from starid.errors import StaridError
 
 if TYPE_CHECKING:
     from starhil.protocol.icd.values import Parameter
@@ -302,7 +303,6 @@ def camera_of(name_or_path: str) -> Camera:
     Raises StaridError, the only error of which `starid` makes one line, where `load_profile` raises its own.
     """
     from starid.camera import Camera
-    from starid.errors import StaridError
 
     try:
         profile = load_profile(name_or_path)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -16,6 +17,7 @@ from starhil.emulator.sensor.pipeline.messages import DIRECTION_BITS, CatalogUps
 from starhil.emulator.sensor.sky.objects import SkyObjects
 from starhil.emulator.simulation.config_model import Strict
 from starhil.protocol.errors import did_you_mean, remedy
+from starhil.protocol.icd import InterfaceDefinition
 
 
 def check_sky(values: dict[str, Any]) -> dict[str, Any]:
@@ -53,17 +55,109 @@ class UpsetFault(Strict):
         return self
 
 
-class DeviceFault(Strict):
-    """A fault of the device."""
+def _nothing(*_: object) -> None:
+    """Do nothing."""
 
-    stuck: bool = False
+
+@dataclass(frozen=True)
+class Effect:
+    """What a fault of the device does, declared beside its key; called with the device, and the value of the key."""
+
+    inject: Callable[[Device, Any], object]
+    end: Callable[[Device], object] = _nothing
+    """Ends a fault that lasts."""
+    active: Callable[[Device], Mapping[str, Any]] = lambda _device: {}
+    """Returns how a fault that lasts is reported; empty if there is none."""
+    check: Callable[[Device, Any], object] = _nothing
+    """Raises EmulatorError if the fault cannot be injected."""
+    enum: str = ""
+    """Enumeration of the names that the key takes; empty if it takes others."""
+    no_fault: int | None = None
+    """Value in the enumeration that is no fault."""
+    ends_at_restart: bool = False
+    """Whether it is injected after a restart in the same request, which would end it."""
+
+    def names(self, icd: InterfaceDefinition) -> list[str]:
+        """Return the names that the key takes."""
+        return [name for name, code in icd.model.enums[self.enum].values.items() if code != self.no_fault]
+
+
+def _stick(device: Device, stuck: bool) -> None:
+    device.unresponsive = stuck
+
+
+def _upset(device: Device, upset: UpsetFault) -> None:
+    if upset.parameter is not None:
+        device.upset_parameter(upset.parameter, upset.bit)
+    elif upset.star is not None:
+        device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
+
+
+def _upset_stars(device: Device) -> dict[str, Any]:
+    stars = [upset.hip for upset in device.cycle.upsets]
+    return {"upset_stars": stars} if stars else {}
+
+
+def _check_upset(device: Device, upset: UpsetFault) -> None:
+    if upset.parameter is not None:
+        definition = device.icd.parameters.get(upset.parameter)
+        if definition is None:
+            hint = remedy(upset.parameter, device.icd.parameters)
+            raise EmulatorError(f"device.upset.parameter: no parameter named {upset.parameter!r}{hint}")
+        if upset.bit >= memory_bits(definition):
+            raise EmulatorError(
+                f"device.upset.bit: {upset.parameter} has bits 0 to {memory_bits(definition) - 1}"
+            )
+    elif upset.bit >= DIRECTION_BITS:
+        raise EmulatorError(f"device.upset.bit: a direction has bits 0 to {DIRECTION_BITS - 1}")
+    elif device.profile.run.algorithm != "geometric":
+        raise EmulatorError("device.upset.star: only the algorithm geometric keeps directions in memory")
+
+
+class DeviceFault(Strict):
+    """A fault of the device: each key has its effect beside it."""
+
+    stuck: Annotated[
+        bool,
+        Effect(
+            _stick,
+            lambda device: _stick(device, stuck=False),
+            lambda device: {"stuck": True} if device.unresponsive else {},
+        ),
+    ] = False
     """Unresponsive: requests are neither counted nor answered; exposures continue."""
-    error: str | None = None
+    error: Annotated[
+        str | None,
+        Effect(
+            lambda device, why: device.modes.fail(why),
+            enum="device_error",
+            no_fault=NO_ERROR,
+            ends_at_restart=True,
+        ),
+    ] = None
     """Enter the error mode with this error, a name in the enumeration `device_error`."""
-    reset: str | None = None
+    reset: Annotated[str | None, Effect(lambda device, cause: device.reset(cause), enum="reset_cause")] = None
     """Restart now with this cause, a name in the enumeration `reset_cause`."""
-    upset: UpsetFault | None = None
+    upset: Annotated[
+        UpsetFault | None,
+        Effect(
+            _upset,
+            lambda device: device.cycle.restore_catalog(),
+            _upset_stars,
+            _check_upset,
+            ends_at_restart=True,
+        ),
+    ] = None
     """Flip a bit in memory; undone by a restart or by restoring the parameters."""
+
+
+EFFECTS: Final[Mapping[str, Effect]] = {
+    name: effect
+    for name, field in DeviceFault.model_fields.items()
+    for effect in field.metadata
+    if isinstance(effect, Effect)
+}
+"""Effects of the keys of `DeviceFault`."""
 
 
 class FaultRequest(Strict):
@@ -88,16 +182,23 @@ BUSES: Final = tuple(name for name in FaultRequest.model_fields if name not in (
 """Names of the buses that faults can affect."""
 
 
+def _values(fault: DeviceFault) -> Iterator[tuple[str, Effect, Any]]:
+    """Yield the keys of a fault that are given, each with its effect and its value."""
+    for key, effect in EFFECTS.items():
+        if (value := getattr(fault, key)) is not None:
+            yield key, effect, value
+
+
 class Faults:
     """The currently injected faults, also of links that are opened later."""
 
-    def __init__(self, device: Device, links: Sequence[AnyLink]) -> None:
+    def __init__(self, device: Device, links: Mapping[str, AnyLink]) -> None:
         self._device = device
         self._links = links
 
     @property
     def _wires(self) -> list[tuple[str, WireFaults[Any]]]:
-        return [(link.bus, link.wire) for link in self._links]
+        return [(link.bus, link.wire) for link in self._links.values()]
 
     def inject(self, request: FaultRequest) -> None:
         """Inject the faults of a request, all or none."""
@@ -110,33 +211,19 @@ class Faults:
             if fault is not None:
                 wire.settings = fault
         if request.device is not None:
-            device.unresponsive = request.device.stuck
-            if request.device.reset is not None:
-                device.reset(request.device.reset)
-            if request.device.error is not None:
-                device.modes.fail(request.device.error)
-            if request.device.upset is not None:
-                upset = request.device.upset
-                if upset.parameter is not None:
-                    device.upset_parameter(upset.parameter, upset.bit)
-                elif upset.star is not None:
-                    device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
+            effects = sorted(_values(request.device), key=lambda item: item[1].ends_at_restart)
+            for _, effect, value in effects:
+                effect.inject(device, value)
         device.signals.faults_changed.emit(request.model_dump(mode="json", exclude_unset=True))
 
     def check(self, request: FaultRequest) -> None:
         """Check that the faults of a request can be injected."""
-        enums = self._device.icd.model.enums
         if request.device is not None:
-            errors = [name for name, code in enums["device_error"].values.items() if code != NO_ERROR]
-            for key, name, known in (
-                ("error", request.device.error, errors),
-                ("reset", request.device.reset, list(enums["reset_cause"].values)),
-            ):
-                if name is not None and name not in known:
-                    near = did_you_mean(name, known)
-                    raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}{near}")
-            if request.device.upset is not None:
-                self._check_upset(request.device.upset)
+            for key, effect, value in _values(request.device):
+                if effect.enum and value not in (known := effect.names(self._device.icd)):
+                    near = did_you_mean(value, known)
+                    raise EmulatorError(f"device.{key}: {value!r} is not one of {', '.join(known)}{near}")
+                effect.check(self._device, value)
         there = {name for name, _ in self._wires}
         for name in BUSES:
             if request.of_bus(name) is not None and name not in there:
@@ -144,27 +231,12 @@ class Faults:
                     f"{name}: this run has no such link; start it with --{name}, or omit this fault"
                 )
 
-    def _check_upset(self, upset: UpsetFault) -> None:
-        if upset.parameter is not None:
-            definition = self._device.icd.parameters.get(upset.parameter)
-            if definition is None:
-                hint = remedy(upset.parameter, self._device.icd.parameters)
-                raise EmulatorError(f"device.upset.parameter: no parameter named {upset.parameter!r}{hint}")
-            if upset.bit >= memory_bits(definition):
-                raise EmulatorError(
-                    f"device.upset.bit: {upset.parameter} has bits 0 to {memory_bits(definition) - 1}"
-                )
-        elif upset.bit >= DIRECTION_BITS:
-            raise EmulatorError(f"device.upset.bit: a direction has bits 0 to {DIRECTION_BITS - 1}")
-        elif self._device.profile.run.algorithm != "geometric":
-            raise EmulatorError("device.upset.star: only the algorithm geometric keeps directions in memory")
-
     def clear(self) -> None:
         """End all faults; the error mode ends only by telecommand, and flipped parameters by a restart."""
         device = self._device
         device.surroundings.faults = {}
-        device.unresponsive = False
-        device.cycle.restore_catalog()
+        for effect in EFFECTS.values():
+            effect.end(device)
         for _, wire in self._wires:
             wire.settings = WireFault()
         device.signals.faults_changed.emit({})
@@ -174,11 +246,8 @@ class Faults:
         found: dict[str, Any] = {}
         if self._device.surroundings.faults:
             found["optical"] = self._device.surroundings.faults
-        if self._device.unresponsive:
-            found["device"] = {"stuck": True}
-        if self._device.cycle.upsets:
-            stars = [upset.hip for upset in self._device.cycle.upsets]
-            found.setdefault("device", {})["upset_stars"] = stars
+        if of_device := {k: v for effect in EFFECTS.values() for k, v in effect.active(self._device).items()}:
+            found["device"] = of_device
         for name, wire in self._wires:
             if not wire.settings.none:
                 found[name] = wire.settings.model_dump()

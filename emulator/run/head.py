@@ -26,30 +26,22 @@ from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import FileStore, MemoryStore, StateStore
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import AnyLink
-from starhil.emulator.links.bus_address import in_use
-from starhil.emulator.links.can import CanLink
-from starhil.emulator.links.name_lock import lock_symlink
-from starhil.emulator.links.serial import SerialLink
+from starhil.emulator.links.table import LINKS, LinkSite
 from starhil.emulator.links.traffic import Traffic
 from starhil.emulator.profile import Profile
 from starhil.emulator.profile.pipeline_setup import SensorPipeline
 from starhil.emulator.run.faults import Faults
 from starhil.emulator.run.pump import ClockPump
-from starhil.emulator.run.recorder import Recorder
 from starhil.emulator.run.revival import PipelineRevival
 from starhil.emulator.run.tape import PipelineState
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.messages import PipelineReady, camera_constants
-from starhil.emulator.simulation.clock import Clock, SteppedClock
+from starhil.emulator.simulation.clock import Clock
 from starhil.emulator.simulation.guard import close_all
 from starhil.emulator.truth.truth import SensorTruth, Truth
-from starhil.protocol.can.frame import CanFrame
-from starhil.protocol.errors import IcdError, ProtocolError
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.serial.cubespace import Dialect
-from starhil.protocol.serial.stack import chosen_dialect
-from starhil.protocol.transports.base import Transport
-from starhil.protocol.transports.paced import SerialTransport
 
 log = logging.getLogger("starhil.run")
 
@@ -75,10 +67,7 @@ class Head:
         self.icd = icd
         self.imager = imager
         self.clock: Clock = wiring.clock
-        self.serial: SerialLink | None = None
-        self.can: CanLink | None = None
-        self.canopen: AnyLink | None = None
-        self.links: list[AnyLink] = []
+        self.links: dict[str, AnyLink] = {}
         """The open links, in the order of opening."""
         self.traffic = Traffic()
         self.ready_fields: dict[str, str] = {}
@@ -86,7 +75,6 @@ class Head:
         self.warm: PipelineReady | None = None
         """What the pipeline reported when it was last ready; None before."""
         self._wiring = wiring
-        self._recorder = wiring if isinstance(wiring, Recorder) else None
         self._on_warm = on_warm
         self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="state")
         self._pump: ClockPump | None = None
@@ -95,7 +83,7 @@ class Head:
         self._awake = asyncio.Event()
         store: StateStore = MemoryStore() if self._state_dir is None else FileStore(self._state_dir)
         self._closers: list[Callable[[], object]] = [store.close]
-        background = run_at_once if isinstance(self.clock, SteppedClock) else self._in_background()
+        background = run_at_once if self.clock.stepped else self._in_background()
         mount = None if profile.truth.mount is None else profile.truth.mount.build()
         try:
             self.device = Device(
@@ -136,90 +124,26 @@ class Head:
 
     async def open_links(self, automatic: str = "auto") -> None:
         """Open ports and buses; `automatic` is the CAN bus for the channel `auto`, such as that of another head."""
-        links, seed = self.profile.links, self.profile.run.seed
-        channel = automatic if links.can.channel == "auto" else links.can.channel
-        stepped = isinstance(self.clock, SteppedClock)  # no time passes between two items of one event
-        if links.serial.port != "off" and self.icd.link.serial is not None:
-            self.serial = SerialLink(self.requests, self._serial_transport(paced=not stepped), seed)
-            self._add(self.serial)
-            self.ready_fields["serial"] = await self.serial.start()
-            if self.serial.dialect is not None:
-                self.ready_fields["dialect"] = self.serial.dialect.value
-        if channel != "off" and self.icd.link.can is not None:
-            gap_s = 0.0 if stepped else links.can.frame_gap_s
-            self.can = CanLink(self.requests, self._can_transport("can", channel), gap_s, seed)
-            self._add(self.can)
-            self.ready_fields["can"] = await self.can.start()
-        if self._has_canopen:
-            await self._open_canopen(
-                self.ready_fields.get("can") or (automatic if channel == "off" else channel)
-            )
-
-    @property
-    def _has_canopen(self) -> bool:
-        links = self.profile.links
-        return bool(links.canopen.node) or (self.icd.canopen_only and links.can.channel != "off")
-
-    def _add(self, link: AnyLink) -> None:
-        self.links.append(link)
-        self.traffic.add(link)
+        site = LinkSite(
+            self.requests, self._wiring, self._state_dir, automatic, self.ready_fields, self._closers
+        )
+        for name, kind in LINKS.items():
+            if kind.opens(self.profile.links, self.icd):
+                link = self.links[name] = kind.make(site)
+                self.traffic.add(link)
+                await link.start()
+                self.ready_fields |= {**link.ready_fields, **self.ready_fields}
 
     def serial_dialect(self) -> Dialect | None:
         """Return the current dialect of the serial line; None without a line or dialects."""
-        return None if self.serial is None else self.serial.dialect
-
-    def _serial_transport(self, *, paced: bool) -> SerialTransport:
-        from starhil.protocol.transports.serial import open_serial
-
-        config, baud = self.profile.links.serial, int(self.device.parameters["serial_baud"])
-        symlink = Path(config.symlink) if config.symlink else None
-        if symlink is not None:
-            self._closers.append(lock_symlink(symlink).close)
-        pace = None if config.pace and paced else False
-        return self._wiring.serial(
-            "serial", lambda: open_serial(config.port, baud, symlink=symlink, paced=pace)
-        )
-
-    def _can_transport(self, name: str, channel: str) -> Transport[CanFrame]:
-        from starhil.protocol.transports.can import new_hub, open_can
-
-        def make() -> Transport[CanFrame]:
-            usual = open_can(channel)
-            return usual if channel != "auto" or self._is_free(usual.description) else new_hub()
-
-        return self._wiring.can(name, make)
-
-    def _is_free(self, bus: str) -> bool:
-        """Return whether no other emulator uses the addresses of this head on a bus; log the one that does."""
-        parameters, numbers = self.device.parameters, {}
-        if self.icd.link.can is not None and self.profile.links.can.channel != "off":
-            numbers["address"] = int(parameters["can_address"])
-        if self._has_canopen:
-            numbers["node"] = int(parameters["canopen_node"])
-        for what, number in numbers.items():
-            why = in_use(what, bus, number)
-            if why:
-                log.warning("%s; this one starts a CAN hub on a free port", why)
-                return False
-        return True
-
-    async def _open_canopen(self, bus: str) -> None:
-        """Open the CANopen link on a bus."""
-        from starhil.emulator.links.canopen import open_canopen
-
-        transport = self._can_transport("canopen", bus)
-        self.canopen = open_canopen(self.requests, transport, self._state_dir, self.profile.run.seed)
-        self._add(self.canopen)
-        opened = await self.canopen.start()
-        self.ready_fields.setdefault("can", opened)
-        self.ready_fields["canopen"] = str(self.device.parameters["canopen_node"])
+        return self.links["serial"].dialect if "serial" in self.links else None
 
     # --- pipeline and time ---
 
     def begin(self) -> None:
         """Start the pipeline; `ready` waits for it."""
-        if not isinstance(self.clock, SteppedClock):
-            self._pump = ClockPump(self.device.scheduler, self.clock, self._recorder)
+        if self.clock.stepped is None:
+            self._pump = ClockPump(self.device.scheduler, self._wiring)
         self._revival = PipelineRevival(self.imager, self.device, self.pipeline_ready, self._record)
         self._warm_up_task = asyncio.create_task(self._warm_up())
 
@@ -237,12 +161,11 @@ class Head:
             raise EmulatorError(f"{self.profile.source_of(error)}: {error}") from None
         except ProtocolError as error:  # a camera constant is outside the limits of its parameter
             raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None
-        if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
+        if self.clock.stepped or device.modes.mode is not Mode.BOOT:
             self._awake.set()
 
     def _record(self, kind: str) -> None:
-        if self._recorder is not None:
-            self._recorder.enter(PipelineState, do=kind)
+        self._wiring.enter(PipelineState, do=kind)
 
     def _mode_changed(self, transition: Transition) -> None:
         if transition.before is Mode.BOOT:
@@ -291,7 +214,9 @@ class Head:
             closers.append(partial(_cancel, self._warm_up_task))
         if self._revival is not None:
             closers.append(self._revival.close)
-        closers += [link.close for link in reversed(self.links)]  # CAN after CANopen: it may run the hub
+        closers += [
+            link.close for link in reversed(self.links.values())
+        ]  # CAN after CANopen: it may run the hub
         closers += [self.imager.close, self._finish_writing]
         closers += reversed(self._closers)
         self._closers.clear()
@@ -309,27 +234,6 @@ async def _cancel(task: asyncio.Task[None]) -> None:
     await asyncio.wait({task})
     if not task.cancelled():
         task.exception()
-
-
-def check_links(profile: Profile, icd: InterfaceDefinition) -> None:
-    """Check that the unit has at least one of the requested links; log those that it lacks."""
-    links, has, name = profile.links, icd.link, icd.name
-    canopen = icd.canopen is not None
-    if links.canopen.node and not canopen:
-        raise EmulatorError(f"links.canopen.node: unit {name} has no CANopen")
-    if "dialect" in links.serial.model_fields_set:
-        try:
-            chosen_dialect(icd, links.serial.dialect)
-        except IcdError as error:
-            raise EmulatorError(f"links.serial.dialect: {error}") from None
-    asked = {"serial.port": links.serial.port, "can.channel": links.can.channel}
-    there = {"serial.port": has.serial is not None, "can.channel": has.can is not None or canopen}
-    wanted = [key for key, value in asked.items() if value != "off"]
-    if wanted and not links.canopen.node and not any(there[key] for key in wanted):
-        raise EmulatorError(f"links.{wanted[0]}: unit {name} has none of the links requested")
-    for key in wanted:
-        if asked[key] != "auto" and not there[key]:
-            log.warning("links.%s: unit %s has no such link; it is not opened", key, name)
 
 
 def _log_frame(measurement: Measurement) -> None:

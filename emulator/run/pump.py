@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.run.recorder import Recorder
 from starhil.emulator.run.tape import Event as EventEntry
+from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.client import PipelineClient
-from starhil.emulator.simulation.clock import Clock, LatchedClock, SteppedClock
+from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.simulation.guard import call_guarded
 from starhil.emulator.simulation.scheduler import Event, Scheduler
 from starhil.protocol.icd.conventions import NANOSECONDS
@@ -29,11 +29,10 @@ PEER_PATIENCE_S: Final = 1.0
 class ClockPump:
     """Runs each event in the event loop when it is due."""
 
-    def __init__(self, scheduler: Scheduler, clock: Clock, recorder: Recorder | None = None) -> None:
+    def __init__(self, scheduler: Scheduler, wiring: Wiring) -> None:
         self._scheduler = scheduler
-        self._clock = clock
-        self._running_clock = clock.source if isinstance(clock, LatchedClock) else clock
-        self._recorder = recorder
+        self._clock = wiring.clock
+        self._wiring = wiring
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._running = False
@@ -61,7 +60,7 @@ class ClockPump:
         due_ns = self._scheduler.next_due_ns()
         if due_ns is None:
             return self._loop.time() + LONGEST_SLEEP_S
-        clock = self._running_clock
+        clock = self._clock.running
         wait_s = (due_ns - clock.now_ns()) / NANOSECONDS / clock.speed
         return self._loop.time() + min(max(wait_s, 0.0), LONGEST_SLEEP_S)
 
@@ -72,13 +71,11 @@ class ClockPump:
 
     def _run_due_event(self) -> None:
         self._timer = None
-        if self._recorder is not None:
-            self._recorder.latch()
+        self._wiring.latch()
         event = self._scheduler.pop_due(self._clock.now_ns())
         try:
-            if event is not None and self._recorder is not None:
-                self._recorder.write(EventEntry)
             if event is not None:  # one at a time, so that the links run in between
+                self._wiring.write(EventEntry)
                 call_guarded("event", event.action, event.due_ns)
         finally:
             if self._running:
@@ -98,9 +95,9 @@ class StepPump:
         transports: Sequence[Transport[Any]],
         clock: SteppedClock,
         time_passes: asyncio.Event,
-        recorder: Recorder | None = None,
+        wiring: Wiring,
     ) -> None:
-        self._recorder = recorder
+        self._wiring = wiring
         self._schedulers = [scheduler for scheduler, _ in devices]
         self._clock = clock
         self._time_passes = time_passes
@@ -127,8 +124,7 @@ class StepPump:
             while (event := self._pop_next(end_ns)) is not None:
                 events += 1
                 self._clock.set_ns(max(event.due_ns, self._clock.now_ns()))
-                if self._recorder is not None:
-                    self._recorder.write(EventEntry)
+                self._wiring.write(EventEntry)
                 call_guarded("event", event.action, event.due_ns)
                 await self._settle()
             self._clock.set_ns(end_ns)

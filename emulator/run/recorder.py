@@ -26,7 +26,7 @@ from starhil.emulator.sensor.pipeline.client import (
     ReplyCallback,
 )
 from starhil.emulator.sensor.pipeline.messages import PipelineEnded
-from starhil.emulator.simulation.clock import LatchedClock, ScaledClock
+from starhil.emulator.simulation.clock import LatchedClock
 from starhil.emulator.simulation.output_file import Output, OutputFile
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.transports.base import Transport
@@ -45,10 +45,10 @@ STATE_FOLDER: Final = "state"
 class Recorder(Wiring):
     """Writes the tape of a run, which `inner` connects to the world."""
 
-    repeatable = True
+    records = repeatable = True
 
     def __init__(self, folder: Path, inner: Wiring) -> None:
-        self._latched = LatchedClock(inner.clock) if isinstance(inner.clock, ScaledClock) else None
+        self._latched = None if (running := inner.clock.running).stepped else LatchedClock(running)
         super().__init__(self._latched or inner.clock)
         self._inner = inner
         self.folder = folder

@@ -21,18 +21,17 @@ import asyncio
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.table import check_links
 from starhil.emulator.profile import Profile
 from starhil.emulator.profile.pipeline_setup import SensorPipeline, make_pipeline
-from starhil.emulator.run.head import Head, check_links
+from starhil.emulator.run.head import Head
 from starhil.emulator.run.pump import StepPump
-from starhil.emulator.run.recorder import Recorder
-from starhil.emulator.run.tape import FeedMessage, NewTruth, TimedEntry
+from starhil.emulator.run.tape import FeedMessage, NewTruth
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
-from starhil.emulator.simulation.clock import SteppedClock, make_clock
+from starhil.emulator.simulation.clock import make_clock
 from starhil.emulator.simulation.guard import close_all
 from starhil.emulator.truth.truth import Truth, TruthHost
 from starhil.protocol.icd import InterfaceDefinition
@@ -59,7 +58,6 @@ class Run:
         self.profile = profiles[0]
         self.wiring = wiring or Wiring(make_clock(self.profile.run.clock))
         self.clock = self.wiring.clock
-        self.recorder = self.wiring if isinstance(self.wiring, Recorder) else None
         self.stepper: StepPump | None = None
         """Advances the stepped clock, once the run has begun; None with another clock."""
         self.time_passes = asyncio.Event()
@@ -74,8 +72,8 @@ class Run:
             self.profile.start_unix_s,
             self.time_passes,
             self._step_in_lock,
-            partial(self.record, NewTruth),
-            partial(self.record, FeedMessage),
+            partial(self.wiring.enter, NewTruth),
+            partial(self.wiring.enter, FeedMessage),
             not self.wiring.plays,
         )
         self.truth = Truth(self.profile.truth, self.profile.folder, host)
@@ -115,12 +113,11 @@ class Run:
 
     def begin(self) -> None:
         """Start the pipelines; time passes beyond the boot when all are ready."""
-        if isinstance(self.clock, SteppedClock):
+        if (stepped := self.clock.stepped) is not None:
             devices = [(head.device.scheduler, head.imager) for head in self.heads]
-            transports = [link.transport for head in self.heads for link in head.links]
-            self.stepper = StepPump(devices, transports, self.clock, self.time_passes, self.recorder)
-        if self.recorder is not None:
-            self.recorder.begin()
+            transports = [link.transport for head in self.heads for link in head.links.values()]
+            self.stepper = StepPump(devices, transports, stepped, self.time_passes, self.wiring)
+        self.wiring.begin()
         for head in self.heads:
             head.begin()
 
@@ -131,11 +128,6 @@ class Run:
         self.clock.start()
         for head in self.heads:
             head.start_time()
-
-    def record(self, entry: type[TimedEntry], **values: Any) -> None:
-        """Record an input that has arrived now, if the run is recorded."""
-        if self.recorder is not None:
-            self.recorder.enter(entry, **values)
 
     async def _step_in_lock(self, seconds: float) -> None:
         """Advance the clock for a simulator; the events of a replay are on its tape."""

@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, RootModel, field_serializer, model_validator
 
+from starhil.emulator.links.table import LINKS, LinkName
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.simulation.config_model import Strict
 from starhil.emulator.truth.config import TruthConfig
@@ -55,7 +56,7 @@ class LinkItem(TimedEntry):
     """Serial bytes or a CAN frame on a link."""
 
     do: Literal["in", "out"]
-    link: Literal["serial", "can", "canopen"]
+    link: LinkName
     data: str | tuple[int, str, bool, bool]
 
     @staticmethod
@@ -76,10 +77,10 @@ class LinkItem(TimedEntry):
     @model_validator(mode="after")
     def _check_item(self) -> Self:
         try:
-            is_serial = isinstance(self.item, bytes)
+            is_of_link = isinstance(self.item, LINKS[self.link].carries)
         except ProtocolError as error:
             raise ValueError(str(error)) from None
-        if is_serial != (self.link == "serial"):
+        if not is_of_link:
             raise ValueError(f"data: not that of the link {self.link}")
         return self
 

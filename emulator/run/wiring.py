@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 from starhil.emulator.device.device import Background
+from starhil.emulator.run.tape import TimedEntry
 from starhil.emulator.sensor.pipeline.client import PipelineClient
 from starhil.emulator.simulation.clock import Clock
 from starhil.protocol.can.frame import CanFrame
@@ -17,6 +19,8 @@ class Wiring:
 
     plays = False
     """Whether a recording is played, so that no sockets are opened."""
+    records = False
+    """Whether a tape of the run is written."""
     repeatable = False
     """Whether results must not depend on the speed of the machine."""
 
@@ -38,3 +42,17 @@ class Wiring:
     def background(self, inner: Background) -> Background:
         """Return the function that runs slow writes."""
         return inner
+
+    # --- the tape, which only a recorder writes ---
+
+    def begin(self) -> None:
+        """Process what arrived while the links were being opened."""
+
+    def latch(self) -> None:
+        """Let the clock show the present time."""
+
+    def enter(self, entry: type[TimedEntry], **values: Any) -> None:
+        """Record an input that has arrived now."""
+
+    def write(self, entry: type[TimedEntry], **values: Any) -> None:
+        """Record what happens at the time of the clock."""

@@ -21,6 +21,8 @@ MAX_SCALE: Final = 1000.0
 class ScaledClock:
     """A clock that runs `speed` times as fast as wall time."""
 
+    stepped: Final = None
+
     def __init__(self, speed: float) -> None:
         if not 0.0 < speed <= MAX_SCALE:
             raise EmulatorError(f"clock: scale {speed:g} is outside 0 … {MAX_SCALE:g}; try scaled:10")
@@ -33,6 +35,11 @@ class ScaledClock:
     def name(self) -> str:
         """Name of the clock on the command line."""
         return f"scaled:{self.speed:g}"
+
+    @property
+    def running(self) -> ScaledClock:
+        """The clock that does not stop while an entry of a tape is processed: itself."""
+        return self
 
     def now_ns(self) -> int:
         """Return the simulation time, nanoseconds."""
@@ -70,6 +77,16 @@ class SteppedClock:
     def __init__(self) -> None:
         self._now_ns = 0
 
+    @property
+    def stepped(self) -> SteppedClock:
+        """The clock that can be advanced: itself; None for clocks that advance by themselves."""
+        return self
+
+    @property
+    def running(self) -> SteppedClock:
+        """The clock that does not stop while an entry of a tape is processed: itself."""
+        return self
+
     def now_ns(self) -> int:
         """Return the simulation time, nanoseconds."""
         return self._now_ns
@@ -90,10 +107,13 @@ class SteppedClock:
 class LatchedClock:
     """A clock that stops while an entry of a tape is processed."""
 
-    def __init__(self, source: ScaledClock) -> None:
-        self.source = source
-        self.name = source.name
-        self.speed = source.speed
+    stepped: Final = None
+
+    def __init__(self, running: ScaledClock | SteppedClock) -> None:
+        self.running = running
+        """The clock that this one follows, and which does not stop."""
+        self.name = running.name
+        self.speed = running.speed
         self._now_ns = 0
 
     def now_ns(self) -> int:
@@ -102,15 +122,15 @@ class LatchedClock:
 
     def switch_on(self, wall_ns: int, limit_ns: int) -> None:
         """Switch on the running clock."""
-        self.source.switch_on(wall_ns, limit_ns)
+        self.running.switch_on(wall_ns, limit_ns)
 
     def start(self) -> None:
         """Start the running clock."""
-        self.source.start()
+        self.running.start()
 
     def latch(self) -> None:
         """Set this clock to the current time."""
-        self._now_ns = self.source.now_ns()
+        self._now_ns = self.running.now_ns()
 
 
 Clock: TypeAlias = ScaledClock | SteppedClock | LatchedClock

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self, TypeAlias, get_args, get_origin
+from typing import Annotated, Any, Final, Literal, Self, TypeAlias, get_args
 
 import numpy as np
 from pydantic import BaseModel, Field, model_validator
@@ -59,18 +58,16 @@ def profile_paths(model: type[BaseModel]) -> dict[str, InProfileFolder]:
         for mark in field.metadata:
             if isinstance(mark, InProfileFolder):
                 found[name] = mark
-        for table in _tables_in(field.annotation):
+        for table in models_in(field.annotation):
             found |= {f"{name}.{key}": mark for key, mark in profile_paths(table).items()}
     return found
 
 
-def _tables_in(annotation: Any) -> Iterator[type[BaseModel]]:
-    """Yield the models of an annotation, but for those in lists."""
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models in an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        yield annotation
-    elif get_origin(annotation) is not list:
-        for part in get_args(annotation):
-            yield from _tables_in(part)
+        return [annotation]
+    return [model for inner in get_args(annotation) for model in models_in(inner)]
 
 
 class AttitudeConfig(Strict):

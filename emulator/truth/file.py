@@ -24,9 +24,9 @@ from starhil.emulator.truth.csv_file import read_csv
 from starhil.emulator.truth.spice_file import META_KERNEL, read_kernels
 from starhil.emulator.truth.stk_file import STK, read_attitude, read_ephemeris
 from starhil.emulator.truth.table import FileTruth, OrbitTable
-from starid.storage.files import MEGABYTE, read_text
+from starhil.protocol.files.user_file import read_user_text
 
-MAX_BYTES: Final = 500 * MEGABYTE
+MAX_BYTES: Final = 500_000_000
 """Maximum size of a truth file: a day at 50 rows per second."""
 
 
@@ -54,7 +54,7 @@ def read_orbit_file(path: Path) -> OrbitTable:
 
 def _text(what: str, path: Path) -> str:
     try:
-        return read_text(path, MAX_BYTES)
+        return read_user_text(path, MAX_BYTES)
     except UnicodeDecodeError as error:
         reason = f"not UTF-8, {error.reason}; of SPICE, give a meta-kernel"
     except OSError as error:

@@ -10,6 +10,7 @@ from typing import Any, Generic, TypeVar
 
 from starhil.hil_tests.attitude import Quaternion
 from starhil.hil_tests.conformance.ports import Port
+from starhil.hil_tests.judge.links import BUSES
 from starhil.hil_tests.judge.messages import Value
 from starhil.hil_tests.judge.rows import Field, Row
 
@@ -36,7 +37,7 @@ class Probe(ABC):
     """Talks to a unit over a link. The run sets `truth` if the true attitude is known; `log` has the sent and received traffic."""
 
     link: str
-    """`serial`, `can` or `canopen`."""
+    """Name in the table of links."""
 
     def __init__(self, port: Port[Any]) -> None:
         self.port = port
@@ -137,7 +138,7 @@ class CaseArea(Generic[ProbeType]):
     name: str
     clause: str
     intrusive: bool = False
-    links: tuple[str, ...] = ("serial", "can")
+    links: tuple[str, ...] = BUSES
     cases: list[Case[ProbeType]] = field(default_factory=list)
 
     def case(

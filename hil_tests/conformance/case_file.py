@@ -37,13 +37,14 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal
 from starhil.hil_tests.conformance.link_probe import LinkProbe
 from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.judge.links import BUSES, LinkName
 from starhil.protocol.errors import did_you_mean
 from starhil.protocol.files.user_file import TomlError, read_user_toml
 from starhil.protocol.files.validation import problems
@@ -84,7 +85,7 @@ class AreaText(_Model):
 
     name: str
     clause: str
-    links: list[Literal["serial", "can", "canopen"]] = ["serial", "can"]
+    links: list[LinkName] = list(BUSES)
     intrusive: bool = False
     cases: list[CaseText]
 

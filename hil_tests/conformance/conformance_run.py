@@ -29,6 +29,7 @@ from starhil.hil_tests.conformance.serial_probe import DEFAULT_BAUD, SerialProbe
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite, settings_of
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.judge.definition import Unit, read_unit
+from starhil.hil_tests.judge.links import BUSES
 from starhil.hil_tests.reports import FAILED
 from starhil.hil_tests.rig.console_feed import RunFeed, console_address
 from starhil.hil_tests.rig.control import ControlClient, Truth
@@ -165,7 +166,7 @@ def run_conformance(
                     control = stack.enter_context(ControlClient(emulator.ready["control"]))
                     truth = Truth(control, unit.conventions).attitude
             if request.view is not None:
-                where = " ".join(port for link in ("serial", "can") if (port := ports.get(link)))
+                where = " ".join(port for link in BUSES if (port := ports.get(link)))
                 address = console_address(request.view, emulator)
                 feed = stack.enter_context(
                     RunFeed(address, kind="conformance", title="Conformance", unit=where, planned=len(cases))

@@ -35,6 +35,7 @@ from itertools import islice
 from typing import Any, Final
 
 from starhil.hil_tests.judge.definition import Parameter, Unit
+from starhil.hil_tests.judge.links import LINKS
 from starhil.hil_tests.judge.messages import Value
 from starhil.hil_tests.judge.rows import PARAMETER, Field, Row
 
@@ -94,7 +95,7 @@ class Life:
     seed: int
     """Seed of the life and of the noise in it."""
     links: tuple[str, ...]
-    """The links that are open: `serial`, `can`, `canopen`."""
+    """The links that are open."""
     profile: dict[str, Any]
     steps: tuple[Step, ...]
     rendered: bool = False
@@ -430,7 +431,7 @@ class LifeGenerator:
         return {"do": "truth", "truth": {"kind": "rate", "attitude": attitude, "rate_deg_s": rate}}
 
     def _fault(self) -> Step:
-        links = {"can" if link == "canopen" else link for link in self._links}
+        links = {LINKS[link].bus for link in self._links}
         kinds: list[dict[str, Any]] = [
             {"optical": {"blocked_share": self._random.choice([0.5, 1.0, 1.0])}},
             {"device": {"stuck": True}},

@@ -18,6 +18,7 @@ from starhil.hil_tests.endurance.ports import CanopenPort, CanPort, Port, Serial
 from starhil.hil_tests.endurance.unit import LiveUnit
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.links import LINKS
 from starhil.hil_tests.judge.messages import Answer, Request, Value
 from starhil.hil_tests.judge.rows import Row
 from starhil.protocol.can.frame import CanFrame
@@ -45,7 +46,7 @@ class Obc:
     def connect(self) -> None:
         """Make the end of each link, for the address or format in use."""
         for link in self._unit.links:
-            name = _ADDRESS[link]
+            name = LINKS[link].address
             in_use = self._oracle.in_use(name)
             if in_use is None:
                 parameter = self._definition.device_parameters[name]
@@ -352,6 +353,4 @@ class Obc:
             raise Violation(f"{row.name}: no valid attitude {recovery_s:g} s after the last fault has ended")
 
 
-_ADDRESS: Final = {"serial": "serial_dialect", "can": "can_address", "canopen": "canopen_node"}
-"""Parameter without which the unit cannot be reached on a link."""
 _SETTERS: Final = frozenset({"set_parameter", "restore_parameters", "default_parameters"})

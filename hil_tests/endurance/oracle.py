@@ -146,7 +146,7 @@ class Oracle:
         self._stored = dict.fromkeys(self.values)
         self.counts = dict.fromkeys(self.counts)
         self._clock = self._boot_count = self._selected = self._last = self._started_s = None
-        self.modes = {"boot", "standby", "error", *IMAGING}
+        self.modes = set(self._definition.modes)
         self.bursts = self._subscribed = True
         self.attitudes.retimed(self.now_s)
 
@@ -194,7 +194,8 @@ class Oracle:
         return any(field.fault(field.read(data)) for field in row.named.values())
 
     def _mode_verdict(self, wanted: str) -> str | None:
-        votes = {wanted in _COMMANDED.get(mode, _RUNNING) for mode in self.modes}
+        running = set(self._definition.modes) - {"boot", "error"}
+        votes = {wanted in _COMMANDED.get(mode, running) for mode in self.modes}
         if votes == {False} or (wanted == "tracking" and not self._has_imaged):
             return "sequence"
         certain = votes == {True} and wanted != "tracking" and "error" not in self.modes
@@ -431,9 +432,8 @@ class Oracle:
             raise Violation(f"{where}: {value}, not {self._last[1]}")
 
 
-_RUNNING: Final = frozenset({"standby", *IMAGING})
 _COMMANDED: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
-"""Modes that can be commanded from a mode; `_RUNNING` from all others (docs/rules.md, R13)."""
+"""Modes that can be commanded from a mode; from all others, any but boot and error (docs/rules.md, R13)."""
 _TIMING: Final = frozenset({"update_rate", "exposure", "delay_time"})
 _ORBIT: Final = frozenset({"orbit_semi_major_axis", "orbit_eccentricity"})
 _BOUND: Final = _TIMING | _ORBIT | {"min_star_pixels", "max_star_pixels"}

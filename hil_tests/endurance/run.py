@@ -12,6 +12,7 @@ from starhil.hil_tests.endurance.oracle import RECOVERY_S, Oracle
 from starhil.hil_tests.endurance.unit import LiveUnit
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.links import LINKS
 
 ORION: Final = {"kind": "fixed", "attitude": {"ra_deg": 83.8, "dec_deg": -1.2, "roll_deg": 0.0}}
 
@@ -105,7 +106,7 @@ class LifeRun:
         if "optical" in fault:
             oracle.covered(fully=fault["optical"].get("blocked_share") == 1.0)
         for link in self._unit.links:
-            if link in fault or (link == "canopen" and "can" in fault):
+            if LINKS[link].bus in fault:
                 oracle.disturbed.add(link)
         device = fault.get("device", {})
         oracle.stuck = bool(device.get("stuck", False)) if device else oracle.stuck

@@ -72,6 +72,8 @@ class Unit:
         Rows that the serial line does not answer.
     errors, device_errors
         Number of each error of a request, and of each cause of the error mode, by name.
+    modes
+        Names of the modes.
     canopen
         Model of `[canopen]`: objects and PDOs; None if the unit has none.
     """
@@ -90,6 +92,7 @@ class Unit:
     unanswered: frozenset[str] = frozenset()
     errors: Mapping[str, int] = field(default_factory=dict)
     device_errors: Mapping[str, int] = field(default_factory=dict)
+    modes: tuple[str, ...] = ()
     first_telemetry_id: int | None = None
     plugin: Any = None
     canopen: Any = None
@@ -202,6 +205,7 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
         ),
         errors=icd.errors,
         device_errors=icd.enum("device_error").values,
+        modes=tuple(icd.model.enums["mode"].values),
         first_telemetry_id=icd.first_telemetry_id,
         plugin=icd.plugin,
         canopen=icd.canopen,

@@ -15,6 +15,7 @@ from starhil.hil_tests.client.async_client import DEFAULT_TIMEOUT_S
 from starhil.hil_tests.client.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
 from starhil.hil_tests.client.wire_log import WireLog
 from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.judge.links import BUSES
 from starhil.hil_tests.rig.control import ControlClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess
 from starhil.protocol.can.frame import bus_name
@@ -41,7 +42,7 @@ class LinkOptions:
     @property
     def links(self) -> tuple[str, ...]:
         """Names of the links in use: `serial`, `can` or both."""
-        return tuple(name for name in ("serial", "can") if getattr(self, name) is not None)
+        return tuple(name for name in BUSES if getattr(self, name) is not None)
 
 
 class Rig:
@@ -82,7 +83,8 @@ class Rig:
         if self.log_folder is not None and link not in self.logs:
             bus = bus_name(port) if link == "can" else ""
             self.logs[link] = self._stack.enter_context(WireLog(self.log_folder / f"{link}.log", bus))
-        options = {**vars(self.options), "serial": None, "can": None, link: port}
+        others: dict[str, None] = dict.fromkeys(BUSES)
+        options = {**vars(self.options), **others, link: port}
         return ObcClient.open(**options, unit=self.icd, log=self.logs.get(link))
 
     def _port(self, link: str) -> str:

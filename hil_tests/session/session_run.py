@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError
+from starhil.hil_tests.judge.links import BUSES
 from starhil.hil_tests.reports import FAILED, PASSED, SKIPPED, prepare_report, write_junit
 from starhil.hil_tests.rig.console_feed import RunFeed, console_address
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, pointed
@@ -184,7 +185,7 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
         if not request.start:
             raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
         wanted = script.defaults.link or "serial"
-        serial, can = ("auto" if wanted in (link, "both") else None for link in ("serial", "can"))
+        serial, can = ("auto" if wanted in (link, "both") else None for link in BUSES)
         options = replace(options, serial=serial, can=can)
     if not request.start and options.serial == "auto":
         raise BenchError("--serial auto needs --start; otherwise name the port")

@@ -24,6 +24,7 @@ from starhil.hil_tests.client.images import write_png
 from starhil.hil_tests.client.raw_traffic import matches, parse_frame, pattern, send_and_listen
 from starhil.hil_tests.client.transactions import Ack, Reading
 from starhil.hil_tests.errors import BenchError, NackError
+from starhil.hil_tests.judge.links import BusName
 from starhil.hil_tests.rig.rig import Rig
 from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.expect import (
@@ -149,7 +150,7 @@ LONGEST_S: Final = 1e6
 Duration = Annotated[float, Field(ge=0.0, le=LONGEST_S)]
 Timeout = Annotated[float, Field(ge=0.001, le=LONGEST_S)]
 Count = Annotated[int, Field(ge=1)]
-Link = Literal["serial", "can", "both"]
+Link = Literal[BusName, "both"]
 
 
 # --- steps ---

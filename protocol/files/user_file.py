@@ -8,7 +8,7 @@ import re
 import stat
 import tomllib
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, BinaryIO, Final
 
 MAX_BYTES: Final = 10_000_000
 """Default size limit, bytes."""
@@ -30,24 +30,35 @@ class UnsuitableFileError(OSError):
     """A path that is not a regular file, or is too large; `strerror` gives the reason."""
 
 
-def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
-    """Return the content of a regular file; a pipe, a device or a socket is rejected without waiting for it.
+def open_user_file(path: Path) -> BinaryIO:
+    """Open a regular file for reading; a pipe, a device or a socket is rejected without waiting for it.
+
+    `starid`, which is installed without this package, has the same in `starid.storage.files`.
 
     Raises
     ------
     OSError
-        The file cannot be read, is not a regular file, or holds more than `limit` bytes; `strerror` gives the
-        reason.
-    ValueError
-        The name is not a valid file name.
+        The file cannot be opened, or is not a regular file; `strerror` gives the reason.
     """
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
-    with os.fdopen(descriptor, "rb") as stream:
-        mode = os.fstat(descriptor).st_mode
-        if stat.S_ISDIR(mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        if not stat.S_ISREG(mode):
-            raise UnsuitableFileError(errno.EINVAL, "not a regular file", str(path))
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
+    except ValueError as error:  # not a valid file name
+        raise UnsuitableFileError(errno.EINVAL, str(error), str(path)) from None
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    raise UnsuitableFileError(errno.EINVAL, "not a regular file", str(path))
+
+
+def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
+    """Return the content of a regular file.
+
+    Raises as `open_user_file`, and OSError if the file holds more than `limit` bytes.
+    """
+    with open_user_file(path) as stream:
         content = stream.read(limit + 1)
     if len(content) > limit:
         raise UnsuitableFileError(errno.EFBIG, f"larger than {limit / 1e6:g} MB", str(path))

@@ -55,10 +55,17 @@ class ActionModel(DefinitionModel):
     arguments: list[ArgumentModel] = []
 
 
+class ModelEnum(EnumDefinition):
+    """An enumeration of the device model."""
+
+    instead: dict[Name, Name] = {}
+    """Value → value that a unit reports in its place if its `map` lacks it, because its documents do not know it."""
+
+
 class DeviceModelFile(DefinitionModel):
     """`configs/units/model.toml`."""
 
-    enum: list[EnumDefinition]
+    enum: list[ModelEnum]
     parameter: list[DeviceParameter]
     quantity: list[QuantityModel]
     action: list[ActionModel]
@@ -84,7 +91,7 @@ class DeviceModel:
     parameters: Mapping[str, Parameter]
     quantities: Mapping[str, QuantityModel]
     actions: Mapping[str, ActionModel]
-    enums: Mapping[str, EnumDefinition]
+    enums: Mapping[str, ModelEnum]
 
     def quantity(self, name: str) -> QuantityModel | None:
         """Return the declaration of a quantity such as `attitude.w` or `stars[3].x`, or None."""

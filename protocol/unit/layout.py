@@ -201,10 +201,24 @@ class Layout:
         if model.map is not None:
             if model.enumeration is not None:
                 raise IcdError("has both `map` and `enum`")
-            return mapped(model.map)
+            enum, aliases = mapped(model.map)
+            members = {**aliases, **{name: name for name in enum.values}}
+            return enum, {**self._stand_ins(model.value, members), **aliases}
         if is_number or (isinstance(model, BitModel) and model.enumeration is None):
             return None, {}
         return enum_of(model.enumeration, self._icd), {}
+
+    def _stand_ins(self, quantity: str | None, members: Mapping[str, str]) -> dict[str, str]:
+        """Return the members that are sent in place of values of a quantity that a `map` lacks."""
+        found = None if quantity is None else self._icd.model.quantity(quantity)
+        if found is None or found.enum is None:
+            return {}
+        instead = self._icd.model.enums[found.enum].instead
+        return {
+            name: members[other]
+            for name, other in instead.items()
+            if name not in members and other in members
+        }
 
     def _slot(self, scalar: str, size: int, order: Order | None = None) -> Slot:
         slot = Slot(len(self.slots), scalar, self.size, size, order or self._icd.conventions.byte_order)

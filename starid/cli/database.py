@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 import time
@@ -98,8 +99,6 @@ def build(
 @group.command("info")
 def info(file: Annotated[Path, typer.Argument(help="Database file.")], as_json: AsJson = False) -> None:
     """Verify a database file and show the parameters it was built with."""
-    import dataclasses
-
     from starid.identification.thesis.database_file import load_database
 
     database = load_database(file)

@@ -17,6 +17,7 @@ from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.profile import Profile
 from starhil.emulator.run.pump import ClockPump
+from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.client import PipelineReply, PipelineRequest
 from starhil.emulator.sensor.pipeline.messages import (
     FrameResult,
@@ -53,9 +54,11 @@ class LoopClock:
 
     name = "real"
     speed = 1.0
+    stepped = None
 
     def __init__(self, loop: SimulatedLoop) -> None:
         self._loop = loop
+        self.running = self
 
     def now_ns(self) -> int:
         return round(self._loop.time() * NANOSECONDS)
@@ -229,7 +232,7 @@ class SimulatedUnit:
             self._damage(self)
         self.device.power_on()
         await self.link.start()
-        self.pump = ClockPump(self.device.scheduler, self.device.clock)
+        self.pump = ClockPump(self.device.scheduler, Wiring(self.device.clock))
         self.pump.start()
         self.device.pipeline_ready({})
 

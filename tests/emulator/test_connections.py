@@ -113,7 +113,7 @@ def test_many_connections_to_the_control_channel_leave_an_open_one_and_the_conso
             port = int(emulation.ready_fields["control"].rpartition(":")[2])
             await flooded(port, '{"do": ', check)
 
-    run(scenario, options=RunOptions(control="127.0.0.1:0", view="auto", make_client=OPTIONS.make_client))
+    run(scenario, options=RunOptions(control="127.0.0.1:0", console=OPTIONS.console))
     assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == [
         "control channel: 16 connections are open, the maximum; further ones are closed, and not logged again"
     ]

@@ -6,7 +6,7 @@ import resource
 import pytest
 
 from starhil.emulator.cli.console_client import ConsoleClient
-from starhil.emulator.launch import RunOptions
+from starhil.emulator.launch import ConsoleOptions, RunOptions
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import command, every_row_read
 
@@ -74,7 +74,7 @@ WRITERS = {
     "truth log": (track, lambda tmp: {"options": RunOptions(truth_log=tmp / "truth.csv")}, "truth.csv"),
     "mcap": (
         track_with_telemetry,
-        lambda tmp: {"options": RunOptions(mcap=tmp / "run.mcap", make_client=ConsoleClient)},
+        lambda tmp: {"options": RunOptions(console=ConsoleOptions(ConsoleClient, files=(tmp / "run.mcap",)))},
         "run.mcap",
     ),
     "state": (
@@ -108,7 +108,7 @@ def test_a_writer_on_a_full_disk_fails_alone(run, tmp_path, caplog, work, keys, 
 def test_what_cannot_be_written_at_all_does_not_stop_frames(run, tmp_path, caplog):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
-        emulation.recorder.write("input", data=object())  # not JSON
+        emulation.wiring.write("input", data=object())  # not JSON
         return await track(emulation)
 
     assert run(scenario, options=RunOptions(record=tmp_path / "recorded")) > 0

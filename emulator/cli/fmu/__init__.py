@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from starhil.emulator.cli.options import ProfileArgument
 from starhil.emulator.cli.output import writing
+from starid.cli.options import one_of
 from starid.cli.output import output_help
 
 if TYPE_CHECKING:
@@ -29,12 +30,9 @@ def export(
 
     Where it is simulated, `starhil` must be installed: the FMU starts it.
     """
-    from typing import cast
-
     from starhil.emulator.cli.fmu.export import export_fmu
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
     from starhil.hil_tests.rig.emulator_process import installed_command
-    from starid.cli.options import one_of
 
     one_of("--fmi", fmi, ("2", "3"))
     name = profile or DEFAULT_PROFILE

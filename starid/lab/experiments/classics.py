@@ -10,6 +10,8 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.camera import Camera
+from starid.identification.thesis.features import extract_features
 from starid.identification.thesis.metrics import boresight_error
 from starid.lab.classic.registry import CLASSICS, class_of, make_identifier
 from starid.lab.experiments.classics_sky import SkyName, ThesisSky, thesis_sky
@@ -89,8 +91,6 @@ def _distance(sky: SkyName, found: tuple[float, float], true: tuple[float, float
 
 def _lsi(context: Context, rng: np.random.Generator, frames: Array, noise: NoiseModel) -> tuple[Array, Array]:
     """The same of the thesis's algorithm on its flat sky."""
-    from starid.identification.thesis.features import extract_features
-
     lsi = context.lost_in_space(0.995)
     errors, times = np.empty((2, len(frames)))
     for i, stars in enumerate(stars_of(context.sky(), frames, rng, lambda _: noise)):
@@ -143,7 +143,6 @@ def _database_figures(context: Context, name: str, solver: Any) -> tuple[float, 
         return 5e-3 * context.lost_in_space(0.995).database.cells, math.nan, math.nan
     if name not in CLASSICS:
         return math.nan, math.nan, math.nan
-    from starid.camera import Camera
 
     fov, pixels, limit = _SENSOR
     papers: Any = make_identifier(name, Camera.from_fov(fov, pixels, pixels), limiting_magnitude=limit)

@@ -8,6 +8,9 @@ from typing import Final
 
 import numpy as np
 
+from starid.identification.thesis.database import DatabaseParameters, build_database
+from starid.identification.thesis.database_file import save_database
+from starid.identification.thesis.frame_grid import make_grid, minimum_overlap, nominal_cells
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 
 _BYTES: Final = 5
@@ -20,10 +23,6 @@ _THREADS: Final = 2
 
 def compute(context: Context, part: Part) -> Results:
     """Number of cells of a database, and time and size if it is built."""
-    from starid.identification.thesis.database import DatabaseParameters, build_database
-    from starid.identification.thesis.database_file import save_database
-    from starid.identification.thesis.frame_grid import make_grid
-
     overlap = part["percent"] / 100.0
     parameters = DatabaseParameters(overlap=overlap)
     cells = make_grid(parameters.geometry, parameters.fov_deg, overlap).cells
@@ -53,8 +52,6 @@ def _inclusive_cells(percent: float) -> float:
 
 def evaluate(e: Evaluation) -> None:
     """Numbers and sizes for each overlap; bounds on the time and the file of the largest database."""
-    from starid.identification.thesis.frame_grid import minimum_overlap, nominal_cells
-
     e.compare("p_min, eq. 2.27", printed=minimum_overlap())
     lines = []
     for percent in e.parameters["percent"]:

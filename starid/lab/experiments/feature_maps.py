@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.identification.thesis.frame_sky import cell_features
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, planar_sky
 from starid.lab.experiments.figures import Panel, Picture, curves_of
 
@@ -30,8 +31,6 @@ _MAPS: Final = {
 
 def _features(centres: Array, kappa: float) -> Array:
     """Features and θ (degrees) of frames, (n, 6); NaN for a frame without stars."""
-    from starid.identification.thesis.frame_sky import cell_features
-
     sky = planar_sky(kappa=kappa, fov_deg=FRAME_DEG)
     table = np.full((len(centres), 6), np.nan)
     sums, out = np.empty(8), np.empty(5)

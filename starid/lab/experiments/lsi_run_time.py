@@ -9,6 +9,10 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.identification.thesis.features import extract_features
+from starid.identification.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
+from starid.identification.thesis.lsi import estimate_from_path, fill_dictionary, lsi_work
+from starid.identification.thesis.subcell import SubcellSearch
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
 from starid.lab.experiments.lsi_trials import ON, frames_under_test, stars_of
 
@@ -40,11 +44,6 @@ def _milliseconds(count: int, work: Callable[[int], object]) -> Array:
 
 def compute(context: Context, part: Part) -> Results:
     """Times of each stage, (n,) ms."""
-    from starid.identification.thesis.features import extract_features
-    from starid.identification.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
-    from starid.identification.thesis.lsi import estimate_from_path, fill_dictionary, lsi_work
-    from starid.identification.thesis.subcell import SubcellSearch
-
     lsi = context.lost_in_space(part["percent"] / 100.0)
     fine = SubcellSearch(lsi)
     step = lsi.database.grid.step_deg

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -88,8 +89,6 @@ def _text(value: float | None, digits: int) -> str:
 
 def write_leaderboard(answer: Answer, folder: Path, command: str) -> list[Path]:
     """Write leaderboard.md, leaderboard.json and two plots, rates.png and times.png, into a folder; return their paths."""
-    import json
-
     folder.mkdir(parents=True, exist_ok=True)
     report, data = folder / "leaderboard.md", folder / "leaderboard.json"
     plots = [folder / "rates.png", folder / "times.png"]

@@ -8,9 +8,9 @@ import numpy as np
 
 from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.console.history import COLUMNS
-from starhil.emulator.launch import RunOptions
+from starhil.emulator.launch import ConsoleOptions, RunOptions
 
-OPTIONS = RunOptions(control="auto", view="auto", make_client=ConsoleClient)
+OPTIONS = RunOptions(control="auto", console=ConsoleOptions(ConsoleClient, view="auto"))
 
 
 WITHIN_S = 20.0

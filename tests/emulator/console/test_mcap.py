@@ -9,7 +9,7 @@ from mcap.reader import make_reader
 from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.console import mcap as recorder_module
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.launch import RunOptions
+from starhil.emulator.launch import ConsoleOptions, RunOptions
 from starhil.hil_tests.client import AsyncObcClient
 from starhil.hil_tests.client.links import CanHostLink, SerialHostLink
 from starhil.protocol.unit import load_unit
@@ -21,7 +21,7 @@ JSON_TYPES = {"object": dict, "string": str, "number": (int, float), "integer": 
 
 
 def options(path, **more):
-    return RunOptions(mcap=path, make_client=ConsoleClient, **more)
+    return RunOptions(console=ConsoleOptions(ConsoleClient, files=(path,)), **more)
 
 
 def messages(path):

@@ -83,7 +83,10 @@ def test_a_page_with_the_view_token_sees_everything_and_commands_nothing(run):
         async with Page(emulation) as page:
             assert page.messages[0]["view_only"] is False
 
-    run(scenario, options=replace(OPTIONS, view_token="for the wall & <screen>"))
+    run(
+        scenario,
+        options=replace(OPTIONS, console=replace(OPTIONS.console, view_token="for the wall & <screen>")),
+    )
 
 
 @pytest.mark.parametrize(
@@ -427,7 +430,7 @@ def test_the_requests_of_a_page_come_at_most_so_often(run, monkeypatch):
                 await page.socket.send_str(text)
             await page.message("answer", lambda item: item["id"] == 29)
 
-    run(scenario, options=replace(OPTIONS, view_token="look"))
+    run(scenario, options=replace(OPTIONS, console=replace(OPTIONS.console, view_token="look")))
     assert len(times) == 30
     assert min(np.diff(times)) >= server.PAGE_TURN_S
 
@@ -536,7 +539,7 @@ def test_an_invalid_address_ends_startup_with_one_line(run, where, said):
         return
 
     with pytest.raises(EmulatorError, match=said):
-        run(nothing, options=replace(OPTIONS, view=where))
+        run(nothing, options=replace(OPTIONS, console=replace(OPTIONS.console, view=where)))
 
 
 def test_a_port_in_use_ends_the_start_in_one_line(run):
@@ -547,4 +550,9 @@ def test_a_port_in_use_ends_the_start_in_one_line(run):
         other.bind(("127.0.0.1", 0))
         other.listen()
         with pytest.raises(EmulatorError, match="cannot listen"):
-            run(nothing, options=replace(OPTIONS, view=f"127.0.0.1:{other.getsockname()[1]}"))
+            run(
+                nothing,
+                options=replace(
+                    OPTIONS, console=replace(OPTIONS.console, view=f"127.0.0.1:{other.getsockname()[1]}")
+                ),
+            )

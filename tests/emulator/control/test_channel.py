@@ -250,7 +250,7 @@ def test_faults_of_the_can_bus_reach_canopen_too(run, monkeypatch, channel):
     )
 
     async def scenario(emulation, _line):
-        wires = [link.wire for link in (emulation.can, emulation.canopen) if link is not None]
+        wires = [link.wire for link in emulation.links.values() if link.bus == "can"]
         assert len(wires) == (1 if channel == "off" else 2)
         async with Control(emulation) as control:
             answer = await control.do("fault", can={"drop": 0.5})
@@ -274,10 +274,10 @@ def test_faults_are_brought_about_and_cleared(run):
             assert device.unresponsive
             await control.do("fault", serial={"drop": 0.5, "split": 4}, device={"error": "injected"})
             assert device.modes.error == "injected"
-            assert emulation.serial.wire.settings.drop == 0.5
+            assert emulation.links["serial"].wire.settings.drop == 0.5
             assert not device.unresponsive
             assert (await control.do("clear_faults"))["faults"] == {}
-            assert emulation.serial.wire.settings.none
+            assert emulation.links["serial"].wire.settings.none
             await control.do("fault", device={"reset": "watchdog"})
             assert device.reset_cause == "watchdog"
             assert device.modes.mode.value == "boot"

@@ -4,19 +4,18 @@ import pytest
 
 from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.launch import RunOptions
+from starhil.emulator.launch import ConsoleOptions, RunOptions
 from starhil.protocol.errors import ProtocolError
 from tests.emulator.runs import FakeImager
 
 NO_PORT = {"serial": {"port": "/dev/no-such-port"}, "can": {"channel": "off"}}
 
 
-def options(tmp_path, **more):
+def options(tmp_path, view="off", **more):
     return RunOptions(
         record=tmp_path / "recorded",
         truth_log=tmp_path / "truth.csv",
-        mcap=tmp_path / "run.mcap",
-        make_client=ConsoleClient,
+        console=ConsoleOptions(ConsoleClient, view, files=(tmp_path / "run.mcap",)),
         **more,
     )
 

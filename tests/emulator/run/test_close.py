@@ -34,7 +34,7 @@ def test_nothing_is_received_while_the_run_ends(run, monkeypatch):
 
     async def scenario(emulation, _line):
         received = []
-        (link,) = emulation.links
+        (link,) = emulation.links.values()
         with open(emulation.ready_fields["serial"], "r+b", buffering=0) as peer:  # noqa: PTH123
 
             async def send_and_close(server):

@@ -57,7 +57,7 @@ def long_step(run):
             counting = asyncio.create_task(count())
             await emulation.stepper.step(STEP_S)
             counting.cancel()
-            statistics = emulation.serial.transport.statistics
+            statistics = emulation.links["serial"].transport.statistics
             assert statistics.dropped == 0
             while len(peer.data) < statistics.sent:
                 await asyncio.sleep(0.01)
@@ -93,14 +93,14 @@ def test_a_peer_that_does_not_read_is_waited_for_once_and_then_again_when_it_rea
     monkeypatch.setattr("starhil.emulator.run.pump.PEER_PATIENCE_S", 0.05)
 
     async def scenario(emulation, _line):
-        statistics = emulation.serial.transport.statistics
+        statistics = emulation.links["serial"].transport.statistics
         os.open(emulation.ready_fields["serial"], os.O_RDWR | os.O_NOCTTY)  # a peer that reads nothing
         await emulation.stepper.step(STEP_S)
         await emulation.stepper.step(STEP_S)
         assert statistics.dropped > 0
         assert caplog.text.count("does not read") == 1
         peer = Peer(emulation.ready_fields["serial"])
-        await emulation.serial.transport.drain()
+        await emulation.links["serial"].transport.drain()
         dropped = statistics.dropped
         await emulation.stepper.step(STEP_S)
         assert statistics.dropped == dropped
@@ -113,13 +113,13 @@ def test_a_peer_that_does_not_read_is_waited_for_once_and_then_again_when_it_rea
 def test_wire_delays_use_simulation_time(run):
     async def scenario(emulation, _line):
         peer = Peer(emulation.ready_fields["serial"])
-        emulation.serial.wire.settings = type(emulation.serial.wire.settings)(delay_s=5.0)
+        emulation.links["serial"].wire.settings = type(emulation.links["serial"].wire.settings)(delay_s=5.0)
         os.write(peer.fd, CUBESPACE.encode_request(Request.of(128)))
         while emulation.device.counters.telemetry == 0:
             await asyncio.sleep(0.01)
         await emulation.stepper.step(4.9)
-        assert emulation.serial.transport.statistics.sent == 0
+        assert emulation.links["serial"].transport.statistics.sent == 0
         await emulation.stepper.step(0.2)
-        assert emulation.serial.transport.statistics.sent > 0
+        assert emulation.links["serial"].transport.statistics.sent > 0
 
     run(scenario)

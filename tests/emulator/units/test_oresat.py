@@ -202,8 +202,7 @@ def test_time_of_the_c3_card_sets_the_clock():
 
 def test_unit_whose_only_link_is_canopen_opens_it_by_itself(run):
     async def scenario(emulation, line):
-        assert emulation.serial is None
-        assert emulation.can is None
+        assert list(emulation.links) == ["canopen"]
         return line
 
     links = {"serial": {"port": "auto"}, "can": {"channel": "auto"}}

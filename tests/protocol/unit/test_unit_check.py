@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
 from starhil.protocol.errors import IcdError
+from starhil.protocol.icd.device_model import device_model
 from starhil.protocol.unit import load_unit
 from starhil.protocol.unit.examples import examine
 
@@ -22,6 +24,7 @@ check = { kind = "custom", name = "parity" }
 request_header = [{ role = "id", type = "u8" }]
 reply_header = [{ role = "id", type = "u8" }]
 """
+LINK = '[link.can]\nkind = "cubespace"\n'
 PLUGIN = '''
 from functools import reduce
 from operator import xor
@@ -391,3 +394,22 @@ def test_a_duplicate_id_is_reported_beside_another_error_of_its_row(tmp_path: Pa
     said = said_of(tmp_path, other + ROW + FIELDS + fault)
     assert len(said) == 2
     assert said[1] == "telemetry row: ID 1 is already used by other"
+
+
+def test_a_value_that_a_map_lacks_is_reported_as_the_one_that_stands_for_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = device_model()
+    mode = model.enums["mode"]
+    numbers = {**mode.values, "survey": 5}
+    known = mode.model_copy(update={"values": numbers, "instead": {"survey": "standby"}})
+    newer = replace(model, enums={**model.enums, "mode": known})
+    monkeypatch.setattr("starhil.protocol.icd.definition.device_model", lambda: newer)
+    members = '"1" = ["boot", "standby"], "2" = "lost_in_space", "3" = "tracking", "9" = "error"'
+    field = f'{{ name = "mode", type = "u8", value = "mode", map = {{ {members} }} }}'
+    (tmp_path / "x.toml").write_text(f"{HEAD}{LINK}{ROW}fields = [{field}]\n", encoding="utf-8")
+    row = load_unit(tmp_path).telemetry["row"]
+    assert row.named_fields["mode"].aliases == {"standby": "boot", "survey": "boot"}
+    known.instead.clear()
+    with pytest.raises(IcdError, match="no number for survey"):
+        load_unit(tmp_path)

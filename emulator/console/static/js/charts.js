@@ -249,7 +249,7 @@ export class Charts {
       const left = Math.max(0, place(times[begin]));
       const right = Math.max(place(Math.min(stop < end ? times[stop + 1] : this.to, reach(stop))), left + 2);
       const name = this.store.hello.modes[modes[begin]];
-      context.fillStyle = colour(`mode-${name}`);
+      context.fillStyle = colour(`mode-${name}`) || colour("mode-standby");
       context.fillRect(left, 0, right - left, height);
       if (!valid[begin]) hatch(context, left, right, height);
       if (right - left > context.measureText(name).width + 8) {

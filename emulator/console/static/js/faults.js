@@ -2,8 +2,6 @@
 
 import { make, setText, short } from "./format.js";
 
-const LEVELS = { optical: "sky and optics", device: "device", serial: "serial line", can: "CAN bus" };
-
 export class Faults {
   constructor(store, link) {
     this.store = store;
@@ -15,6 +13,7 @@ export class Faults {
   }
 
   build(hello) {
+    this.titles = Object.fromEntries(hello.faults.map((level) => [level.level, level.title]));
     this.cover = make("button", { type: "button", class: "primary large", id: "cover", title: "c", onclick: () => this.toggleCover() });
     const clear = make("button", { type: "button", class: "large", id: "clear-faults", title: "x", text: "clear all faults", onclick: () => this.clear() });
     this.now = document.getElementById("active-faults");
@@ -34,8 +33,8 @@ export class Faults {
   level(level) {
     const controls = level.controls.filter((control) => control.name !== "blank").map((control) => this.control(control));
     const form = make("form", { onsubmit: (event) => { event.preventDefault(); this.inject(level.level, controls); } });
-    form.append(...controls.map((control) => control.element), make("button", { type: "submit", class: "primary", text: `inject on ${LEVELS[level.level] || level.level}` }));
-    return make("fieldset", { "data-level": level.level }, make("legend", { text: LEVELS[level.level] || level.level }), form);
+    form.append(...controls.map((control) => control.element), make("button", { type: "submit", class: "primary", text: `inject on ${level.title}` }));
+    return make("fieldset", { "data-level": level.level }, make("legend", { text: level.title }), form);
   }
 
   // A control for one value: `read` returns the value, or undefined if it is the default.
@@ -119,7 +118,7 @@ export class Faults {
     for (const [level, content] of Object.entries(active)) {
       for (const [name, item] of Object.entries(content)) {
         const idle = level !== "optical" && (item === 0 || item === false || name === "gap_s");
-        if (!idle) chips.push(make("li", { text: `${LEVELS[level] || level}: ${name} ${shown(item)}` }));
+        if (!idle) chips.push(make("li", { text: `${this.titles[level] || level}: ${name} ${shown(item)}` }));
       }
     }
     this.now.replaceChildren(...chips);

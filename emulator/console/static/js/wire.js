@@ -14,30 +14,38 @@ export class Wire {
     this.host = document.getElementById("wire");
     this.lines = [];
     this.hidden = new Set(["part"]);
-    this.buses = new Set(["serial", "can"]);
+    this.titles = {};
+    this.hiddenBuses = new Set();
     this.own = false;
     this.text = "";
     this.held = false;
     this.build();
-    store.on("hello", () => (this.lines = []));
+    store.on("hello", (hello) => this.begin(hello));
     store.on("wire", (message) => this.add(message));
   }
 
+  check(label, on, change) {
+    const box = make("input", { type: "checkbox", onchange: () => { change(box.checked); this.render(); } });
+    box.checked = on;
+    return make("label", { class: "check" }, box, label);
+  }
+
+  begin(hello) {
+    this.lines = [];
+    this.titles = hello.buses;
+    this.buses.replaceChildren(...Object.entries(this.titles).map(([bus, title]) => this.check(title, !this.hiddenBuses.has(bus), (on) => (on ? this.hiddenBuses.delete(bus) : this.hiddenBuses.add(bus)))));
+  }
+
   build() {
-    const check = (label, on, change) => {
-      const box = make("input", { type: "checkbox", onchange: () => { change(box.checked); this.render(); } });
-      box.checked = on;
-      return make("label", { class: "check" }, box, label);
-    };
     const filter = make("input", { type: "search", placeholder: "filter: name, hex, address", "aria-label": "filter", oninput: () => { this.text = filter.value.trim().toLowerCase(); this.render(); } });
     this.hold = make("button", { type: "button", text: "hold", onclick: () => this.setHeld(!this.held) });
-    const buses = ["serial", "can"].map((bus) => check(bus === "can" ? "CAN" : bus, true, (on) => (on ? this.buses.add(bus) : this.buses.delete(bus))));
-    const kinds = KINDS.map(([label, names]) => check(label, !this.hidden.has(names[0]), (on) => { for (const name of names) on ? this.hidden.delete(name) : this.hidden.add(name); }));
-    kinds.push(check("console", this.own, (on) => (this.own = on)));
+    this.buses = make("span", { class: "bar wrap" });
+    const kinds = KINDS.map(([label, names]) => this.check(label, !this.hidden.has(names[0]), (on) => { for (const name of names) on ? this.hidden.delete(name) : this.hidden.add(name); }));
+    kinds.push(this.check("console", this.own, (on) => (this.own = on)));
     this.left = make("output", { class: "num dim" });
     const save = make("a", { class: "button", href: address("/wire.log"), download: "wire.log", text: "candump log" });
     this.list = make("ol", { class: "trace scroll" });
-    this.host.append(make("div", { class: "bar wrap" }, filter, this.hold, save, this.left), make("div", { class: "bar wrap" }, ...buses, ...kinds), this.list);
+    this.host.append(make("div", { class: "bar wrap" }, filter, this.hold, save, this.left), make("div", { class: "bar wrap" }, this.buses, ...kinds), this.list);
   }
 
   show(active) {
@@ -61,7 +69,7 @@ export class Wire {
   }
 
   wanted(line) {
-    if ((line.own && !this.own) || this.hidden.has(line.kind) || !this.buses.has(line.bus)) return false;
+    if ((line.own && !this.own) || this.hidden.has(line.kind) || this.hiddenBuses.has(line.bus)) return false;
     return !this.text || `${line.raw} ${line.text}`.toLowerCase().includes(this.text);
   }
 
@@ -83,7 +91,7 @@ export class Wire {
       { class: line.kind, "data-n": String(line.n) },
       make("time", { class: "num dim", text: wall(line.t) }),
       make("span", { class: "num dim since", title: "seconds since the line below" }),
-      make("span", { class: "way", text: `${line.bus === "can" ? "CAN" : "ser"} ${line.out ? "◀" : "▶"}`, title: line.out ? "from the device" : "to the device, or between others" }),
+      make("span", { class: "way", text: `${this.titles[line.bus].slice(0, 3)} ${line.out ? "◀" : "▶"}`, title: line.out ? "from the device" : "to the device, or between others" }),
       make("span", { class: "text", text: line.text, title: line.text }),
       make("code", { text: line.raw }),
     );
