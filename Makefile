@@ -1,5 +1,6 @@
 # make demo        set up and run the product end to end; results in out/demo
 # make test        set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest is available)
+# make lowest      the tests of LOWEST with the lowest versions of dependencies that pyproject.toml admits
 # make lint        ruff, mypy --strict and the contracts of imports
 # make docs        pages and API reference in out/docs; a warning or a broken link fails
 # make reproduce   every experiment of the thesis again; report.md, tables and plots in out/reproduce
@@ -22,7 +23,7 @@ BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos obc clean
+.PHONY: help demo test lowest lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos obc clean
 help:
 	@sed -n 's/^# make /make /p' Makefile
 
@@ -46,6 +47,18 @@ demo: $(VENV)/.product
 test: $(VENV)/.developer
 	-@tools/install_test_packages tests obc
 	@tools/test_in_lanes $(BIN)/python
+
+# what only tests need is of today; oem and others of the extra `test` need more than the lowest versions
+LOWEST_TOOLS := 'pytest>=8' 'hypothesis>=6.100' msgpack cantools canmatrix space_packet_parser dcf-tools durand spiceypy
+LOWEST := tests/protocol $(addprefix tests/emulator/,device links pipeline truth) $(addprefix tests/starid/,imaging geometric test_camera.py test_catalog.py test_jit.py)
+out/lowest/.installed: pyproject.toml tools/lowest_versions.py
+	$(PYTHON) -m venv out/lowest
+	$(PYTHON) tools/lowest_versions.py >out/lowest/constraints.txt
+	out/lowest/bin/pip install --quiet --no-compile --constraint out/lowest/constraints.txt --editable '.[lab]' $(LOWEST_TOOLS)
+	@touch $@
+
+lowest: out/lowest/.installed
+	nice out/lowest/bin/python -m pytest -q -m "not process and not browser and not socketcan" $(LOWEST)
 
 lint: $(VENV)/.developer
 	$(BIN)/ruff check .

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.sensor.noise import Digitizer
 from starhil.protocol.errors import remedy
 from starid.arrays import Array
 from starid.attitude import ARCSEC_PER_RAD
-from starid.camera import Camera
-from starid.imaging.detection import DetectionSettings
+
+if TYPE_CHECKING:
+    from starhil.emulator.sensor.noise import Digitizer
+    from starid.camera import Camera
+    from starid.imaging.detection import DetectionSettings
 
 ARCSEC2_PER_SR: Final = (180.0 * 3600.0 / math.pi) ** 2
 SOLAR_COLOUR_B_V: Final = 0.65
@@ -185,10 +187,14 @@ class SensorModel:
     @property
     def digitizer(self) -> Digitizer:
         """Parameters of the noise kernel."""
+        from starhil.emulator.sensor.noise import Digitizer  # with kernels: a profile is read without numba
+
         return Digitizer(self.read_noise_e, self.full_well_e, self.gain_e_per_dn, self.offset_dn, self.max_dn)
 
     def detection_settings(self, **changes: Any) -> DetectionSettings:
         """Return detection settings with gain, saturation and, if uniform over the image, spot width."""
+        from starid.imaging.detection import DetectionSettings
+
         settings = DetectionSettings(
             psf_sigma_px=self.psf_sigma_px if self.psf_growth == 0.0 else None,
             gain_e_per_dn=self.gain_e_per_dn,

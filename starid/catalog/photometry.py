@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array
+from starid.arrays import Array, elementwise
 
 EVEN_PAIR: Final = 0.45
 """Brightness ratio from which a single spot fits two stars at their centre of light."""
@@ -89,8 +91,7 @@ def absolute_magnitude(magnitude: ArrayLike, parallax_mas: ArrayLike) -> Array:
 
 def flux_ratio(magnitude: ArrayLike) -> Array:
     """Flux of a magnitude relative to magnitude zero: 10^(−0.4·m)."""
-    ratio: Array = 10.0 ** (-0.4 * np.asarray(magnitude, np.float64))
-    return ratio
+    return elementwise(partial(math.pow, 10.0), -0.4 * np.asarray(magnitude, np.float64))
 
 
 def fitted_share(distance: Array, brightness_ratio: Array) -> Array:
@@ -107,4 +108,6 @@ def fitted_share(distance: Array, brightness_ratio: Array) -> Array:
     brightness_ratio : ndarray
         Ratio of the companion's flux to the star's, at most 1.
     """
-    return 1.0 - (1.0 - np.exp(-(distance**2))) * np.maximum(1.0 - (brightness_ratio / EVEN_PAIR) ** 2, 0.0)
+    return 1.0 - (1.0 - elementwise(math.exp, -(distance**2))) * np.maximum(
+        1.0 - (brightness_ratio / EVEN_PAIR) ** 2, 0.0
+    )

@@ -10,10 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array32, GreyImage
-from starid.kernels.jit import compiled_ieee, compiled_sums
+from starid.errors import StaridError
+from starid.kernels.jit import compiled_ieee, inner
 
 BLOCK_PX: Final = 32
 """Side of a block, pixels: stars cover about 1 % of it, and stray light is nearly plane within it."""
+
+WIDEST_BLOCK_PX: Final = 64
+"""Largest side of a block, pixels."""
 
 MIN_NOISE_DN: Final = 12.0**-0.5
 """Standard deviation of rounding to whole counts."""
@@ -60,29 +64,42 @@ class Background:
         return median(self.noise)
 
 
-@compiled_sums
+@compiled_ieee
 def _refine(values: Array32, dx: Array32, dy: Array32, start: tuple[float, float], plane: Array32) -> None:
     """Fit a plane to the samples of a block without its stars: (level, slopes along dx and dy, noise).
 
     Samples farther than 3.5 sigmas from the plane are left out, with half a count of allowance, so that rounding to
-    counts does not make the interval asymmetric. The offsets `dx`, `dy` are relative to their mean.
+    counts does not make the interval asymmetric. `dx` (columns,) and `dy` (rows,) are relative to their mean. Sums are
+    formed for each column first: in this order with vector instructions of any width, and without.
     """
     level, sigma = np.float32(start[0]), np.float32(start[1])
     along = across = np.float32(0.0)
+    columns = np.int32(dx.size)
+    sums = np.empty((5, WIDEST_BLOCK_PX), np.float32)
     for _ in range(_ROUNDS):
         reach = np.float32(_CLIP_SIGMA) * sigma + np.float32(0.5)
+        sums[:] = np.float32(0.0)
+        for row in range(dy.size):
+            middle, off_row = level + across * dy[row], dy[row]
+            line = values[row * columns : (row + 1) * columns]
+            for k in range(columns):
+                off = line[k] - middle - along * dx[k]
+                inside = np.float32(1.0) if abs(off) <= reach else np.float32(0.0)
+                off *= inside
+                sums[0, k] += inside
+                sums[1, k] += off
+                sums[2, k] += off * off
+                sums[3, k] += off * off_row
+                sums[4, k] += inside * (off_row * off_row)
         kept = total = squares = tilt = tilt2 = lean = lean2 = np.float32(0.0)
-        for k in range(values.size):
-            off = values[k] - level - along * dx[k] - across * dy[k]
-            inside = np.float32(1.0) if abs(off) <= reach else np.float32(0.0)
-            off *= inside
-            kept += inside
-            total += off
-            squares += off * off
-            tilt += off * dx[k]
-            tilt2 += inside * dx[k] * dx[k]
-            lean += off * dy[k]
-            lean2 += inside * dy[k] * dy[k]
+        for k in range(columns):
+            kept += sums[0, k]
+            total += sums[1, k]
+            squares += sums[2, k]
+            tilt += sums[1, k] * dx[k]
+            tilt2 += sums[0, k] * dx[k] * dx[k]
+            lean += sums[3, k]
+            lean2 += sums[4, k]
         if kept < np.float32(_MIN_SAMPLES):
             break
         mean = total / kept
@@ -98,13 +115,11 @@ def _refine(values: Array32, dx: Array32, dy: Array32, start: tuple[float, float
     plane[0], plane[1], plane[2], plane[3] = level, along, across, sigma
 
 
-@compiled_ieee
-def _sample_offsets(columns: int, count: int, dx: Array32, dy: Array32) -> None:
-    """Offsets of the samples of a block from their mean, pixels: all columns of every fourth row."""
-    middle_x, middle_y = 0.5 * (columns - 1), 0.5 * (count // columns - 1)
+@inner
+def _offsets(count: int, step: float, offsets: Array32) -> None:
+    """Positions of `count` columns or rows, `step` pixels apart, relative to their mean."""
     for k in range(count):
-        dx[k] = np.float32(k % columns - middle_x)
-        dy[k] = np.float32((k // columns - middle_y) * _ROW_STEP)
+        offsets[k] = np.float32((k - 0.5 * (count - 1)) * step)
 
 
 @compiled_ieee
@@ -113,8 +128,8 @@ def _block_statistics(image: GreyImage, block: int, level: Array32, noise: Array
     height, width = image.shape
     first = np.empty(_FIRST_SAMPLES, np.int32)
     values = np.empty(block * block, np.float32)
-    dx = np.empty(block * block, np.float32)
-    dy = np.empty(block * block, np.float32)
+    dx = np.empty(block, np.float32)
+    dy = np.empty(block, np.float32)
     laid = (0, 0)
     plane = np.empty(4, np.float32)
     for row in range(level.shape[0]):
@@ -139,14 +154,16 @@ def _block_statistics(image: GreyImage, block: int, level: Array32, noise: Array
                     j -= 1
                 first[j + 1] = key
             spread = (first[(3 * chosen) // 4] - first[chosen // 4]) / _QUARTILE_SIGMA
-            if laid != (columns, count):
-                laid = (columns, count)
-                _sample_offsets(columns, count, dx, dy)
+            rows = count // columns
+            if laid != (columns, rows):
+                laid = (columns, rows)
+                _offsets(columns, 1.0, dx)
+                _offsets(rows, _ROW_STEP, dy)
             start = (float(first[chosen // 2]), max(spread, 0.5))
-            _refine(values[:count], dx[:count], dy[:count], start, plane)
+            _refine(values[:count], dx[:columns], dy[:rows], start, plane)
             # from the centre of the sampled pixels to the centre of the block on the grid
             first_row = top + column % _ROW_STEP
-            last_row = first_row + _ROW_STEP * (count // columns - 1)
+            last_row = first_row + _ROW_STEP * (rows - 1)
             off_y = (row + 0.5) * block - 0.5 - 0.5 * (first_row + last_row)
             off_x = (column + 0.5) * block - 0.5 - (left + 0.5 * (columns - 1))
             level[row, column] = plane[0] + plane[1] * off_x + plane[2] * off_y
@@ -159,6 +176,8 @@ def estimate_background(image: GreyImage, block_px: int = BLOCK_PX) -> Backgroun
     A block that would extend beyond the image is moved inside, so that every block is whole; an image smaller than a
     block is one block.
     """
+    if not 1 <= block_px <= WIDEST_BLOCK_PX:
+        raise StaridError(f"background block_px: must be 1…{WIDEST_BLOCK_PX} pixels, not {block_px}")
     height, width = image.shape
     rows, columns = -(-height // block_px), -(-width // block_px)
     level = np.empty((rows, columns), dtype=np.float32)

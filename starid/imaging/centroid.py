@@ -16,7 +16,7 @@ import numpy as np
 
 from starid.arrays import Array, Array32, record_type
 from starid.imaging.normal_table import normal, quick_normal
-from starid.kernels.jit import compiled_ieee, compiled_sums
+from starid.kernels.jit import compiled_ieee
 
 UNUSABLE: Final = 1e9
 """Least count at which a pixel of a window has no weight: saturated and masked pixels are set to infinity."""
@@ -116,7 +116,7 @@ def spot_model(
             k += 1
 
 
-@compiled_sums
+@compiled_ieee
 def trail_model(
     x: float,
     y: float,
@@ -170,7 +170,7 @@ def star_model(
         spot_model(x, y, shape[0], window, model, work)
 
 
-@compiled_sums
+@compiled_ieee
 def _normal_equations(
     pixels: Array32, model: Array, flux: float, noise: tuple[float, float, float], sums: Array
 ) -> None:
@@ -300,7 +300,7 @@ def fit_star(
             return
 
 
-@compiled_sums
+@compiled_ieee
 def explained(pixels: Array32, model: Array) -> tuple[float, float, float, float, float]:
     """Flux of a shape, and how far it and the highest pixel alone each reduce the sum of squares of a window.
 

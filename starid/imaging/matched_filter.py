@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from starid.arrays import Array32, GreyImage, Indices32
 from starid.imaging.background import block_position
-from starid.kernels.jit import compiled_ieee, compiled_sums
+from starid.kernels.jit import compiled_ieee
 
 INTEGER_TAPS_SUM: Final = 16
 """Sum of the integer filter's taps along one axis, so that a byte smoothed along both axes fits 16 bits."""
@@ -147,7 +147,7 @@ def _flag_groups(
         flags[group] = any_above != np.uint64(0)
 
 
-@compiled_sums
+@compiled_ieee
 def _flag_groups_integer(
     row: npt.NDArray[np.uint16], limit: npt.NDArray[np.uint16], flags: npt.NDArray[np.uint8]
 ) -> None:

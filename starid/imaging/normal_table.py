@@ -17,7 +17,7 @@ _PER_SIGMA: Final = 32
 _COUNT: Final = int(2 * REACH) * _PER_SIGMA + 1
 _NODES: Final = np.linspace(-REACH, REACH, _COUNT)
 _CDF: Final = np.array([0.5 * math.erfc(-node / math.sqrt(2.0)) for node in _NODES])
-_PDF: Final = np.exp(-0.5 * _NODES**2) / math.sqrt(2.0 * math.pi)
+_PDF: Final = np.array([math.exp(-0.5 * node * node) / math.sqrt(2.0 * math.pi) for node in _NODES])
 
 
 @compiled_ieee

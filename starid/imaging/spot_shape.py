@@ -17,7 +17,7 @@ from starid.arrays import Array, Array32, GreyImage, Indices32, Mask
 from starid.imaging.background import interpolate_at, median
 from starid.imaging.normal_table import gaussian
 from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, lengths_and_mismatches
-from starid.kernels.jit import compiled_ieee, compiled_sums
+from starid.kernels.jit import compiled_ieee
 
 MOMENT_COLUMNS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
@@ -56,7 +56,7 @@ class SpotShape:
     stars: int
 
 
-@compiled_sums
+@compiled_ieee
 def _weighted_sums(
     image: GreyImage,
     box: tuple[int, int, int, int],

@@ -33,7 +33,7 @@ DEFAULT_LIMIT_MB: Final = 500.0
 BYTES_PER_MB: Final = 1_000_000
 _PRIVATE: Final = 0o700
 _KERNELS: Final = "kernels"
-KERNEL_SUFFIX: Final = ".kernel"
+KERNEL_SUFFIX: Final = ".nbc"
 _OWN_NAME: Final = re.compile(
     rf"(?:hipparcos|stars|index|features)-[0-9a-f]{{16}}\.(?:npz|bin)|{_KERNELS}/[0-9a-f]{{16}}"
 )
@@ -194,17 +194,22 @@ def cached_files() -> list[CachedFile]:
         if _OWN_NAME.fullmatch(_name(path)):
             try:
                 state = path.stat()
-                size = sum(each.stat().st_size for each in path.iterdir()) if path.is_dir() else state.st_size
+                size = _size_of_folder(path) if path.is_dir() else state.st_size
             except OSError:  # another process has removed it, or it is a link to nowhere
                 continue
             found.append(CachedFile(path, size, state.st_mtime))
     return sorted(found, key=lambda each: each.used_s)
 
 
+def _size_of_folder(folder: Path) -> int:
+    """Bytes of the files in a folder and the folders in it."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if not path.is_dir())
+
+
 def kernels_written_since(unix_s: float) -> int:
     """Return how many kernels have been compiled into the cache since a Unix time in seconds."""
     count = 0
-    for path in cache_dir().glob(f"{_KERNELS}/*/*{KERNEL_SUFFIX}"):
+    for path in cache_dir().glob(f"{_KERNELS}/*/*/*{KERNEL_SUFFIX}"):
         try:
             count += path.stat().st_mtime >= unix_s
         except FileNotFoundError:  # another process has removed it

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
+
+import pytest
+
+import starhil
 
 FOR_THE_WORKER = ("numba", "scipy", "sklearn", "cv2", "matplotlib", "erfa", "sgp4", "aiohttp", "mcap")
 
@@ -11,4 +16,16 @@ FOR_THE_WORKER = ("numba", "scipy", "sklearn", "cv2", "matplotlib", "erfa", "sgp
 def test_the_links_start_without_the_libraries_of_the_pipeline():
     text = "import sys, starhil.emulator.launch; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert not set(FOR_THE_WORKER) & set(done.stdout.split())
+
+
+PROFILES = sorted(
+    path.stem for path in (Path(starhil.__file__).parent / "configs" / "profiles").glob("*.toml")
+)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_profile_is_read_without_them(profile: str) -> None:
+    text = "import sys; from starhil.emulator.profile import load_profile; load_profile(sys.argv[1]); print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", text, profile], capture_output=True, text=True, check=True)
     assert not set(FOR_THE_WORKER) & set(done.stdout.split())

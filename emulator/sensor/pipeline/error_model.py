@@ -34,7 +34,6 @@ from starhil.emulator.sensor.pipeline.messages import (
     as_quaternion,
 )
 from starhil.emulator.simulation.signal import Signal
-from starid.camera import Camera
 
 ARCSEC: Final = math.radians(1.0 / 3600.0)
 
@@ -64,6 +63,8 @@ class ErrorModel:
     pending: Final = 0
 
     def __init__(self, setup: PipelineSetup) -> None:
+        from starid.camera import Camera  # with numba, which other pipelines load in a process of their own
+
         self._setup = setup
         self._camera = Camera.from_dict(setup.camera)
         self._constants: dict[str, Any] = self._camera.to_dict()

@@ -145,7 +145,7 @@ class Pipeline:
             preview=self._setup.previews,
         )
         if helper is not None:
-            gc.disable()  # as in the helper
+            gc.disable()  # compiling makes many objects and little garbage
             for rate in _WARM_UP_RATES_RAD_S:
                 frame = self._renderer.render(Attitude.identity(), rate, exposure_s=_WARM_UP_EXPOSURE_S)
                 detect(frame.image, detection_settings(self._sensor.detection_settings(), settings))

@@ -10,16 +10,14 @@ from __future__ import annotations
 import gc
 import subprocess
 import sys
-from typing import Any
 
 from starhil.emulator.sensor.pipeline.parent_death_signal import end_with_parent
-from starid.camera.projection import back_project_kernel
+from starid.kernels.kernel_cache import nothing_compiled
 
 
 def start_helper() -> subprocess.Popen[bytes] | None:
     """Start the process that compiles the star identifier, unless the cache has kernels; the caller must wait for it."""
-    kernel: Any = back_project_kernel
-    if kernel.store.in_cache:
+    if not nothing_compiled():
         return None
     return subprocess.Popen(
         [sys.executable, "-m", "starhil.emulator.sensor.pipeline.precompile"], stdin=subprocess.DEVNULL

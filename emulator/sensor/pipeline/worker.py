@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import pickle
 import signal
@@ -37,6 +38,7 @@ def serve_in_thread(link: socket.socket) -> None:
 
 def serve(link: socket.socket) -> None:
     """Receive the setup, then requests, until the emulator closes the socket."""
+    gc.disable()  # until the pipeline is warm: imports make many objects and little garbage
     from starhil.emulator.sensor.pipeline.pipeline import make_pipeline  # imported while the emulator starts
 
     setup = _receive(link)

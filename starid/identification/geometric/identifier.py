@@ -38,7 +38,6 @@ from starid.identification.geometric.tracking import MIN_TRACKED, MIN_TRACKED_KN
 from starid.identification.geometric.verification import WHOLE_SKY
 from starid.identification.single_camera import CheckedDetections, SingleCameraIdentifier, near
 from starid.identification.solution import Mode, Reason, Solution
-from starid.kernels.jit import BoundKernel
 
 BLEND_PX: Final = 2.0
 TRACKING_WINDOW_PX: Final = 20.0
@@ -171,8 +170,8 @@ class Identifier(SingleCameraIdentifier):
 
     def _set_index(self, index: IndexArrays) -> None:
         self._index = index
-        self._identify_kernel: Callable[..., Answer] = BoundKernel(identify_kernel, index)
-        self._track_kernel: Callable[..., Answer] = BoundKernel(track_kernel, index)
+        self._identify_kernel: Callable[..., Answer] = functools.partial(identify_kernel, index)
+        self._track_kernel: Callable[..., Answer] = functools.partial(track_kernel, index)
 
     def _configure(self, camera: Camera, fov_tolerance: float, effort: Effort) -> None:
         """Set what depends on the camera and the bounds of the search."""

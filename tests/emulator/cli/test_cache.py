@@ -110,10 +110,10 @@ def test_a_limit_that_is_not_a_number_is_reported_and_the_default_used(
 
 
 def test_kernels_are_counted_from_a_time_on(folder: Path) -> None:
-    machine_code = folder / "kernels" / "0123456789abcdef"
+    machine_code = folder / "kernels" / "0123456789abcdef" / "package"
     machine_code.mkdir(parents=True)
     for number, written_s in enumerate((1000, 2000, 3000)):
-        path = machine_code / f"kernel-{number}.kernel"
+        path = machine_code / f"kernel-{number}.nbc"
         path.write_bytes(b"code")
         os.utime(path, (written_s, written_s))
         path.with_suffix(".part").write_bytes(b"being written")

@@ -1,15 +1,23 @@
-"""The cache of compiled kernels: kept while the sources are the same, renewed when a callee changes."""
+"""Kernels: compiled by what numba publishes, cached while the sources are the same, never run from a damaged file."""
 
 from __future__ import annotations
 
+import ast
+import json
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from starid.kernels.store import read_verified, source_stamp, write_verified
+import starid
+from starid.arrays import Array
+from starid.kernels import kernel_cache
+from starid.kernels.jit import compiled, compiled_ieee, inner, inner_checked
 from starid.storage.cache import cached_files, remove
 
 CALLER = """
@@ -22,18 +30,25 @@ def outer(x: float) -> float:
     return scaled(x) + FACTOR
 
 
-print(outer(1.0), 1 - outer.store.compilations)
+print(outer(1.0), sum(outer.stats.cache_hits.values()))
 """
 
 INNER = """
-from starid.kernels.jit import compiled
+from starid.kernels.jit import inner
 
-FACTOR = {factor}
+FACTOR = 0.5
 
 
-@compiled
+@inner
 def scaled(x: float) -> float:
     return {slope} * x
+"""
+
+RUN = """
+import sys
+from starid.kernels import kernel_cache
+kernel_cache.PACKAGES = ("other_kernels",)
+import other_kernels.outer
 """
 
 
@@ -43,29 +58,30 @@ def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def write_package(folder: Path, *, slope: float = 2.0) -> None:
+def write_package(folder: Path, *, slope: float = 2.0) -> Path:
     package = folder / "other_kernels"
     package.mkdir(parents=True, exist_ok=True)
     (package / "__init__.py").write_text("")
     (package / "outer.py").write_text(CALLER)
-    (package / "inner.py").write_text(INNER.format(factor=0.5, slope=slope))
+    (package / "inner.py").write_text(INNER.format(slope=slope))
+    return folder
 
 
-def run(folder: Path) -> list[str]:
+def process(folder: Path) -> subprocess.Popen[str]:
+    """Start a process that calls the kernel; without bytecode, which is compared by the second of its source."""
+    command = [sys.executable, "-B", "-c", RUN]
+    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def run(folder: Path, warning: str = "") -> list[str]:
     """Result of the kernel in a new process, and how often its machine code was loaded."""
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-B",
-            "-c",
-            "import other_kernels.outer",
-        ],  # bytecode is compared by the second of its source
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return done.stdout.split()
+    out, errors = process(folder).communicate(timeout=300)
+    assert (warning in errors) if warning else not errors, errors
+    return out.split()
+
+
+def machine_code(cache_folder: Path) -> list[Path]:
+    return [path for path in cache_folder.rglob("*") if path.suffix in (".nbi", ".nbc")]
 
 
 def test_a_changed_callee_in_another_module_is_detected(tmp_path: Path) -> None:
@@ -74,40 +90,146 @@ def test_a_changed_callee_in_another_module_is_detected(tmp_path: Path) -> None:
     assert run(tmp_path) == ["2.5", "1"], "the second process loads the machine code"
     write_package(tmp_path, slope=3.0)
     assert run(tmp_path) == ["3.5", "0"], "the old code is not run"
+    write_package(tmp_path)
+    assert run(tmp_path) == ["2.5", "1"], "that of the former sources is still there"
 
 
-def test_copies_of_a_package_share_machine_code_while_their_sources_are_equal(tmp_path: Path) -> None:
-    first, second = tmp_path / "first", tmp_path / "second"
-    write_package(first)
-    write_package(second)
-    assert run(first) == ["2.5", "0"]
-    assert run(second) == ["2.5", "1"], "compiled once for both"
-    write_package(second, slope=3.0)
-    assert run(second) == ["3.5", "0"], "other sources are compiled again"
-    assert run(first) == ["2.5", "1"], "and leave the code of the first in place"
-    assert run(second) == ["3.5", "1"]
-    assert not list(tmp_path.glob("*/other_kernels/**/*.kernel")), "nothing is kept beside the sources"
+def test_the_key_follows_what_modules_with_kernels_import(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.syspath_prepend(write_package(tmp_path))
+    monkeypatch.setattr(kernel_cache, "PACKAGES", ("other_kernels",))
+    key = kernel_cache.sources_key()
+    (tmp_path / "other_kernels" / "unrelated.py").write_text("X = 1\n")
+    assert kernel_cache.sources_key() == key
+    (tmp_path / "other_kernels" / "inner.py").write_text(INNER.format(slope=4.0))
+    assert kernel_cache.sources_key() != key
 
 
-def test_machine_code_is_cached_beside_the_sources_if_the_cache_folder_cannot_be_made(
+def test_the_key_covers_every_module_with_kernels() -> None:
+    key = set(kernel_cache.modules_with_kernels())
+    holders = {path for path in sources() if b"from starid.kernels.jit import" in path.read_bytes()}
+    assert len(holders) > 50
+    assert {path.stem for path in holders} <= {name.rpartition(".")[2] for name in key}
+
+
+def damage(path: Path, change: Callable[[bytes], bytes]) -> None:
+    """Change the content of a file, not its time."""
+    written_s = path.stat().st_mtime
+    path.write_bytes(change(path.read_bytes()))
+    os.utime(path, (written_s, written_s))
+
+
+def truncated(data: bytes) -> bytes:
+    return data[: len(data) // 2]
+
+
+def emptied(_data: bytes) -> bytes:
+    return b""
+
+
+def zeroed(data: bytes) -> bytes:
+    """As a file may be after a power failure: the right length, but no content."""
+    return data[: len(data) // 2] + bytes(len(data) - len(data) // 2)
+
+
+@pytest.mark.parametrize("change", [truncated, emptied, zeroed])
+def test_a_damaged_file_is_removed(cache_folder: Path, change: Callable[[bytes], bytes]) -> None:
+    folder = cache_folder / "kernels" / "0123456789abcdef"
+    good, bad = folder / "package" / "good.nbc", folder / "package" / "bad.nbc"
+    good.parent.mkdir(parents=True)
+    for path in (good, bad):
+        path.write_bytes(b"code" * 100)
+    kernel_cache.record_checksums(folder)
+    damage(bad, change)
+    kernel_cache.remove_damaged(folder)
+    assert (good.exists(), bad.exists()) == (True, False)
+
+
+def test_a_kernel_whose_machine_code_is_damaged_is_compiled_again(tmp_path: Path, cache_folder: Path) -> None:
+    write_package(tmp_path)
+    assert run(tmp_path) == ["2.5", "0"]
+    damages = {".nbi": truncated, ".nbc": zeroed}
+    files = machine_code(cache_folder)
+    assert {path.suffix for path in files} == set(damages)
+    for file in files:
+        damage(file, damages[file.suffix])
+    assert run(tmp_path) == ["2.5", "0"], "compiled again"
+    assert run(tmp_path) == ["2.5", "1"], "and kept"
+
+
+def test_a_file_that_a_running_process_has_replaced_is_kept(cache_folder: Path) -> None:
+    folder = cache_folder / "kernels" / "0123456789abcdef"
+    path = folder / "package" / "kernel.nbi"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"one signature")
+    kernel_cache.record_checksums(folder)
+    path.write_bytes(b"two signatures")
+    later_s = time.time() + 1.0
+    os.utime(path, (later_s, later_s))
+    kernel_cache.remove_damaged(folder)
+    assert path.exists()
+
+
+def test_files_without_a_checksum_are_kept_while_their_process_may_run(cache_folder: Path) -> None:
+    folder = cache_folder / "kernels" / "0123456789abcdef"
+    new, old = folder / "package" / "new.nbc", folder / "package" / "old.nbc"
+    new.parent.mkdir(parents=True)
+    for path in (new, old):
+        path.write_bytes(b"code")
+    os.utime(old, (time.time() - 7200.0,) * 2)
+    kernel_cache.remove_damaged(folder)
+    assert (new.exists(), old.exists()) == (True, False)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1]", '{"package/gone.nbc": 1}'])
+def test_a_damaged_list_of_checksums_is_written_again(cache_folder: Path, text: str) -> None:
+    folder = cache_folder / "kernels" / "0123456789abcdef"
+    path = folder / "package" / "new.nbc"
+    path.parent.mkdir(parents=True)
+    (folder / "checksums.json").write_text(text)
+    os.utime(folder / "checksums.json", (1000, 1000))
+    path.write_bytes(b"code")
+    kernel_cache.remove_damaged(folder)
+    kernel_cache.record_checksums(folder)
+    assert list(json.loads((folder / "checksums.json").read_text())) == ["package/new.nbc"]
+
+
+def test_processes_that_start_together_on_an_empty_cache_all_get_the_result(tmp_path: Path) -> None:
+    write_package(tmp_path)
+    started = [process(tmp_path) for _ in range(3)]
+    ended = [each.communicate(timeout=300) for each in started]
+    assert [(out.split()[0], errors) for out, errors in ended] == [("2.5", "")] * 3
+    assert run(tmp_path) == ["2.5", "1"]
+
+
+def test_kernels_run_where_the_cache_cannot_be_written_and_a_line_says_so(
     tmp_path: Path, cache_folder: Path
 ) -> None:
     cache_folder.write_text("a file in the way")
     write_package(tmp_path)
-    assert run(tmp_path) == ["2.5", "0"]
-    assert run(tmp_path) == ["2.5", "1"]
+    warning = (
+        f"{cache_folder}: kernels cannot be cached, so that each process compiles them; set STARHIL_CACHE_DIR"
+    )
+    assert run(tmp_path, warning) == ["2.5", "0"]
+    assert run(tmp_path, warning) == ["2.5", "0"]
 
 
-def test_kernels_run_if_machine_code_cannot_be_cached(tmp_path: Path, cache_folder: Path) -> None:
-    cache_folder.write_text("a file in the way")
-    write_package(tmp_path)
-    (tmp_path / "other_kernels" / "__pycache__").write_text("a file in the way")
-    assert run(tmp_path) == ["2.5", "0"]
-    assert run(tmp_path) == ["2.5", "0"]
-
-
-def test_the_least_recently_used_machine_code_is_evicted_beyond_the_limit(
+def test_a_cache_that_can_only_be_read_is_used(
     tmp_path: Path, cache_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = cache_folder / "kernels" / kernel_cache.sources_key()
+    (folder / "package").mkdir(parents=True)
+    (folder / "package" / "kernel.nbc").write_bytes(b"code")
+    monkeypatch.setattr("starid.kernels.kernel_cache.os.access", lambda *_arguments: False)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    assert kernel_cache.use_kernel_cache()
+    copy = Path(os.environ["NUMBA_CACHE_DIR"])
+    assert copy != folder
+    assert (copy / "package" / "kernel.nbc").read_bytes() == b"code"
+
+
+def test_the_machine_code_of_former_sources_is_evicted_beyond_the_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STARHIL_CACHE_LIMIT_MB", "0")
     write_package(tmp_path)
@@ -115,8 +237,8 @@ def test_the_least_recently_used_machine_code_is_evicted_beyond_the_limit(
     (old,) = [each.path for each in cached_files()]
     write_package(tmp_path, slope=3.0)
     assert run(tmp_path) == ["3.5", "0"]
-    assert [each.path for each in cached_files() if each.path == old] == []
-    assert cached_files(), "the machine code of the last kernel stays"
+    (new,) = [each.path for each in cached_files()]
+    assert new != old
 
 
 def test_loaded_machine_code_counts_as_used(tmp_path: Path) -> None:
@@ -139,43 +261,60 @@ def test_clearing_the_cache_removes_machine_code(tmp_path: Path) -> None:
     assert run(tmp_path) == ["2.5", "0"]
 
 
-def test_stamps_follow_imports_only() -> None:
-    assert source_stamp("starid.camera.projection") == source_stamp("starid.camera.projection")
-    assert source_stamp("starid.camera.projection") != source_stamp("starid.kernels.jit")
+@inner_checked
+def checked_inverse(value: float) -> float:
+    return 1.0 / value
 
 
-def truncated(data: bytes) -> bytes:
-    return data[: len(data) // 2]
+@compiled_ieee
+def inverse(value: float) -> float:
+    return checked_inverse(value)
 
 
-def emptied(_data: bytes) -> bytes:
-    return b""
+@inner
+def ieee_inverse(value: float) -> float:
+    return 1.0 / value
 
 
-def zeroed(data: bytes) -> bytes:
-    """As a file may be after a power failure: the right length, but no content."""
-    return data[:-100] + bytes(100)
+@compiled
+def unbounded(values: Array) -> float:
+    return ieee_inverse(values[0])
 
 
-def test_damaged_machine_code_is_removed_and_compiled_again(tmp_path: Path, cache_folder: Path) -> None:
-    write_package(tmp_path)
-    assert run(tmp_path) == ["2.5", "0"]
-    files = list(cache_folder.rglob("*.kernel"))
-    assert len(files) == 1, "the kernel contains the one that it calls"
-    for file in files:
-        file.write_bytes(truncated(file.read_bytes()))
-    assert run(tmp_path) == ["2.5", "0"], "compiled again"
-    assert run(tmp_path) == ["2.5", "1"], "and kept"
+def test_only_a_checked_function_raises_for_division_by_zero() -> None:
+    assert inverse(4.0) == 0.25
+    with pytest.raises(ZeroDivisionError):
+        inverse(0.0)
+    assert unbounded(np.zeros(1)) == np.inf
 
 
-@pytest.mark.parametrize("damage", [truncated, emptied, zeroed])
-def test_a_damaged_cache_file_counts_as_missing_and_is_removed(tmp_path: Path, damage) -> None:
-    path = tmp_path / "folder" / "code.kernel"
-    assert read_verified(path) is None
-    write_verified(path, b"code" * 100)
-    assert read_verified(path) == b"code" * 100
-    path.write_bytes(damage(path.read_bytes()))
-    assert read_verified(path) is None
-    assert not path.exists()
-    write_verified(path, b"new")
-    assert read_verified(path) == b"new"
+def sources() -> Iterator[Path]:
+    home = Path(starid.__file__).parent
+    yield from home.rglob("*.py")
+    for name in ("emulator", "protocol", "hil_tests"):
+        yield from (home.parent / "starhil" / name).rglob("*.py")
+
+
+def test_only_what_numba_publishes_is_used_and_sums_are_never_reordered() -> None:
+    """numba is imported in one module, for `njit` with documented options; no name with an underscore, no fastmath."""
+    documented = {"nogil", "cache", "error_model"}
+    users = []
+    for path in sources():
+        tree = ast.parse(path.read_bytes())
+        for node in ast.walk(tree):
+            match node:
+                case ast.Import(names=names):
+                    modules = [each.name for each in names]
+                case ast.ImportFrom(module=str(module)):
+                    modules = [module]
+                case ast.keyword(arg="fastmath"):
+                    raise AssertionError(f"{path}: fastmath reorders sums")
+                case _:
+                    continue
+            if any(each.partition(".")[0] in ("numba", "llvmlite") for each in modules):
+                users.append((path.name, ast.unparse(node)))
+    assert users == [("jit.py", "from numba import njit")]
+    tree = ast.parse((Path(starid.__file__).parent / "jit.py").read_bytes())
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    options = {word.arg for call in calls if ast.unparse(call.func) == "njit" for word in call.keywords}
+    assert options == documented

@@ -1,0 +1,180 @@
+"""The folder in which numba caches the machine code of kernels.
+
+It is in the cache folder (`starid.storage.cache`), one for each state of the sources: numba notices that the file of a kernel has
+changed, but not that a function or constant which the kernel takes from another file has. Installations at the same path
+with equal sources share it. Numba does not check what it loads, so each file's checksum is kept beside it; a damaged file
+is removed, and its kernel compiled again.
+"""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import importlib.metadata
+import importlib.util
+import json
+import logging
+import os
+import re
+import shutil
+import sys
+import tempfile
+import time
+import zlib
+from pathlib import Path
+from typing import Final
+
+from starid.storage.cache import KERNEL_SUFFIX, cache_dir, evict, kernel_folder, mark_used
+from starid.storage.files import write_atomically
+
+_log = logging.getLogger(__name__)
+
+PACKAGES: Final = ("starid", "starhil/emulator/sensor")
+"""Packages of which modules hold kernels."""
+
+_VERSIONS: Final = ("numba", "numpy")
+_CHECKSUMS: Final = "checksums.json"
+_UNFINISHED_S: Final = 3600.0
+"""Time after which a file without a checksum was left by a process that did not end properly, seconds."""
+
+_HOLDS_KERNELS: Final = b"from starid.kernels.jit import"
+_IMPORT: Final = re.compile(rb"^(?:from|import)[ \t]+([\w.]+)(?:[ \t]+import[ \t]+(.+))?", re.MULTILINE)
+
+
+def use_kernel_cache() -> bool:
+    """Let numba, which is imported later, cache kernels, and return whether it can.
+
+    Where the folder in the cache cannot be written, a copy of it in the temporary folder is used, which is removed at the
+    end of the process; if that leaves kernels to be compiled, a warning is logged.
+    """
+    key = sources_key()
+    folder = kernel_folder(key)
+    try:
+        if folder is None or (folder.exists() and not os.access(folder, os.W_OK | os.X_OK)):
+            folder = _temporary_copy(folder or cache_dir() / key)
+        else:
+            folder.mkdir(parents=True, exist_ok=True)
+            mark_used(folder)
+            atexit.register(record_checksums, folder, time.time())
+        remove_damaged(folder)
+    except OSError as error:
+        _log.warning("kernels cannot be cached (%s): each process compiles them", error)
+        return False
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    if "numba" in sys.modules:  # which has read its environment already
+        sys.modules["numba"].config.CACHE_DIR = str(folder)
+    return True
+
+
+def nothing_compiled() -> bool:
+    """Return whether the folder in the cache has no kernel yet, so that processes can share the work of the first start."""
+    folder = Path(os.environ.get("NUMBA_CACHE_DIR", ""))
+    return folder.parent == cache_dir() / "kernels" and not any(folder.glob(f"*/*{KERNEL_SUFFIX}"))
+
+
+def _temporary_copy(folder: Path) -> Path:
+    """Copy a folder of kernels to one that is removed at the end of the process."""
+    copy = Path(tempfile.mkdtemp(prefix="starhil-kernels-"))
+    atexit.register(shutil.rmtree, copy, ignore_errors=True)
+    if folder.is_dir():
+        shutil.copytree(folder, copy, dirs_exist_ok=True)
+    else:
+        _log.warning(
+            "%s: kernels cannot be cached, so that each process compiles them; set STARHIL_CACHE_DIR to a folder that "
+            "can be written",
+            cache_dir(),
+        )
+    return copy
+
+
+def remove_damaged(folder: Path) -> None:
+    """Remove the files of a folder of kernels that differ from their checksums, or were left without one.
+
+    A file that is newer than the checksums, but not old, belongs to a process that runs and will record it.
+    """
+    checksums, recorded_s = _read_checksums(folder)
+    running_s = max(recorded_s, time.time() - _UNFINISHED_S)
+    for path, name in _files(folder):
+        try:
+            if path.stat().st_mtime > running_s or checksums.get(name) == _checksum(path):
+                continue
+            _log.info("%s: damaged, or left by a process that was ended: removed; compiled again", path)
+            path.unlink(missing_ok=True)
+        except FileNotFoundError:  # another process has replaced it
+            continue
+
+
+def record_checksums(folder: Path, since_s: float = 0.0) -> None:
+    """Write the checksums of the files that were written since a Unix time, then keep the cache within its limit."""
+    checksums, _ = _read_checksums(folder)
+    current = {}
+    for path, name in _files(folder):
+        try:
+            known = name in checksums and path.stat().st_mtime < since_s
+            current[name] = checksums[name] if known else _checksum(path)
+        except FileNotFoundError:  # another process has replaced it
+            continue
+    if current == checksums:
+        return
+    try:
+        write_atomically(folder / _CHECKSUMS, lambda part: part.write_text(json.dumps(current)))
+    except OSError as error:
+        _log.warning("%s: cannot be written (%s): kernels are compiled again", folder, error.strerror)
+    evict(keep=folder)
+
+
+def _files(folder: Path) -> list[tuple[Path, str]]:
+    """Return the files of numba in a folder of kernels, each with its name in the list of checksums."""
+    return [(path, path.relative_to(folder).as_posix()) for path in folder.glob("*/*.nb[ic]")]
+
+
+def _checksum(path: Path) -> int:
+    return zlib.crc32(path.read_bytes())
+
+
+def _read_checksums(folder: Path) -> tuple[dict[str, int], float]:
+    """Return the checksums of files by name, and the Unix time of their record; none if there is none, or it is damaged."""
+    path = folder / _CHECKSUMS
+    try:
+        checksums = json.loads(path.read_bytes())
+        if isinstance(checksums, dict):
+            return checksums, path.stat().st_mtime
+    except (OSError, ValueError):
+        pass
+    return {}, 0.0
+
+
+def sources_key() -> str:
+    """Return 16 hexadecimal digits for the state of the modules with kernels, of all that they import, and of numba."""
+    digest = hashlib.sha256()
+    for name in _VERSIONS:
+        digest.update(f"{name} {importlib.metadata.version(name)}\n".encode())
+    for module, source in sorted(modules_with_kernels().items()):
+        digest.update(module.encode() + b"\0" + source + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def modules_with_kernels() -> dict[str, bytes]:
+    """Return the sources of the modules with kernels and of those that they import, directly or not, by name."""
+    sources, waiting = {}, []
+    for name in PACKAGES:
+        top, _, rest = name.partition("/")
+        spec = importlib.util.find_spec(top)
+        for home in (spec.submodule_search_locations if spec else None) or ():
+            for path in (Path(home) / rest).rglob("*.py"):
+                module = ".".join((top, *path.relative_to(home).with_suffix("").parts)).removesuffix(
+                    ".__init__"
+                )
+                sources[module] = path.read_bytes()
+                if _HOLDS_KERNELS in sources[module]:
+                    waiting.append(module)
+    needed: dict[str, bytes] = {}
+    while waiting:
+        module = waiting.pop()
+        if module in needed or module not in sources:
+            continue
+        needed[module] = sources[module]
+        for package, members in _IMPORT.findall(sources[module]):
+            waiting.append(package.decode())
+            waiting += [f"{package.decode()}.{member}" for member in re.findall(r"\w+", members.decode())]
+    return needed
