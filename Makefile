@@ -22,6 +22,8 @@ BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
+# a target whose recipe failed is made again: the file .venv/pyvenv.cfg is written before pip is found to be missing
+.DELETE_ON_ERROR:
 .PHONY: help demo test lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos obc clean
 help:
 	@sed -n 's/^# make /make /p' Makefile

@@ -199,6 +199,13 @@ def run(
         Errors whose text is one line for the user, or that have several such lines as `problems`.
     """
     show_every_character()
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in (
+        "",
+        "0",
+    ):  # a kernel in Python takes minutes for an image
+        exit_for_bad_input(
+            program, "NUMBA_DISABLE_JIT is set: images are only made and solved by compiled kernels; unset it"
+        )
     try:
         status = build(words or words_to_complete())(
             args=list(words), prog_name=program, standalone_mode=False
