@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -12,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.errors import EmulatorError, explained
+from starhil.emulator.launch.machine import description
 from starhil.emulator.profile import Profile
 from starhil.emulator.run.recorder import (
     RUN_FILE,
@@ -35,6 +38,8 @@ class _RunFile(BaseModel):
     profile: Profile
     ends: bool = False
     """Whether the tape of a complete run ends with the entry `end`: not if an older version recorded it."""
+    machine: dict[str, str] = {}
+    """Processor and versions of libraries, see `machine.description`; empty if an older version recorded it."""
 
 
 def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
@@ -69,6 +74,7 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
         (folder / SCENARIO_FILE).write_text(text, encoding="utf-8")
     run = {
         "starhil": importlib.metadata.version("starhil"),
+        "machine": description(),
         "folder": str(profile.folder.resolve()),
         "profile": values,
         "ends": True,
@@ -76,8 +82,19 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
 
 
-def read_run(folder: Path) -> tuple[Profile, bool]:
-    """Return the profile of a recording, and whether its tape ends with the entry `end`."""
+@dataclass(frozen=True)
+class RecordedRun:
+    """What is known of a recorded run beside its tape."""
+
+    profile: Profile
+    ends: bool
+    """Whether its tape ends with the entry `end`."""
+    machine: Mapping[str, str]
+    """Machine on which it was recorded."""
+
+
+def read_run(folder: Path) -> RecordedRun:
+    """Return the profile of a recording, and what else its `run.json` has."""
     path = folder / RUN_FILE
     try:
         text = read_recorded(path)
@@ -88,7 +105,7 @@ def read_run(folder: Path) -> tuple[Profile, bool]:
     if isinstance(truth, FileConfig):
         truth = truth.model_copy(update={"path": str((folder / truth.path).absolute())})
     profile = run.profile.model_copy(update={"truth": truth})
-    return profile.read_from(Path(run.folder) / RUN_FILE), run.ends
+    return RecordedRun(profile.read_from(Path(run.folder) / RUN_FILE), run.ends, run.machine)
 
 
 def read_recorded(path: Path) -> str:
