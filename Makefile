@@ -1,5 +1,5 @@
 # make demo        set up and run the product end to end; results in out/demo
-# make test        set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest is available)
+# make test        set up and run all tests (those on a real vcan0 in a guest); the last lines say what ran, and why tests were skipped
 # make lint        ruff, mypy --strict and the contracts of imports
 # make docs        pages and API reference in out/docs; a warning or a broken link fails
 # make reproduce   every experiment of the thesis again; report.md, tables and plots in out/reproduce
