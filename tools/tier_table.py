@@ -30,14 +30,9 @@ class Tier(NamedTuple):
 
 def read_tier(folder: Path, name: str) -> Tier:
     """Return what a tier has run, from its files in the folder."""
-    report, reason = folder / f"{name}.xml", folder / f"{name}.reason"
+    report = folder / f"{name}.xml"
     if not report.exists():
-        text = (
-            reason.read_text(encoding="utf-8").strip()
-            if reason.exists()
-            else "its run has ended without a report"
-        )
-        return Tier(name, "none", "all", (text,))
+        return Tier(name, "none", "all", ((folder / f"{name}.reason").read_text(encoding="utf-8"),))
     cases = list(ET.parse(report).iter("testcase"))  # noqa: S314 (written by pytest on this machine)
     skips = [case.find("skipped") for case in cases]
     reasons = Counter(skip.get("message", "") for skip in skips if skip is not None)

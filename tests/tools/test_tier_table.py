@@ -24,6 +24,7 @@ def printed(folder: Path) -> list[str]:
 
 
 def test_run_and_skipped_tests_are_counted_and_reasons_are_listed(tmp_path):
+    (tmp_path / "processes.reason").write_text("ended without a report\n")
     (tmp_path / "processes.xml").write_text(REPORT)
     assert printed(tmp_path) == ["tier run skipped why", "processes 3 3 2 x no tshark", "1 x no java"]
 
