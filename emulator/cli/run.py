@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -149,7 +150,7 @@ class AroundOptions:
     record: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Record to a folder (for `starhil replay`) or to FILE.mcap (for Foxglove). Missing folders are created. "
+            help="Record to a folder (for `starhil replay`) or to FILE.mcap (for Foxglove; extra `mcap`). Missing folders are created. "
             "Repeatable."
         ),
     ] = None
@@ -169,6 +170,8 @@ class AroundOptions:
         for path, option in ((self.truth_log, "--truth-log"), (mcap, "--record")):
             if path is not None:
                 prepare_output(path, option)
+        if mcap is not None:
+            importlib.import_module("mcap.writer")  # an extra, which is missing before anything starts
         return RunOptions(
             truth_log=self.truth_log,
             overwrite=self.overwrite,
