@@ -49,7 +49,9 @@ def test_a_recording_without_the_package_of_its_extra_is_rejected_before_the_sta
 ) -> None:
     monkeypatch.setitem(sys.modules, "mcap", None)  # as if it were not installed
     monkeypatch.delitem(sys.modules, "mcap.writer", raising=False)
-    status, out, err = run_command_line("run", "--record", str(tmp_path / "run.mcap"), "--serial", "off", "--can", "off")
+    status, out, err = run_command_line(
+        "run", "--record", str(tmp_path / "run.mcap"), "--serial", "off", "--can", "off"
+    )
     assert (status, out) == (2, "")
     assert err == "starhil: mcap is not installed; run: pip install 'starhil[mcap]'\n"
 
