@@ -1,5 +1,5 @@
 # make demo        set up and run the product end to end; results in out/demo
-# make test        set up and run all tests (the real-vcan0 tier runs where a User-Mode Linux guest is available)
+# make test        set up and run all tests (those on a real vcan0 in a guest); the last lines say what ran, and why tests were skipped
 # make lowest      the tests of LOWEST with the lowest versions of dependencies that pyproject.toml admits
 # make lint        ruff, mypy --strict and the contracts of imports
 # make docs        pages and API reference in out/docs; a warning or a broken link fails
@@ -23,6 +23,8 @@ BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
+# a target whose recipe failed is made again: the file .venv/pyvenv.cfg is written before pip is found to be missing
+.DELETE_ON_ERROR:
 .PHONY: help demo test lowest lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos obc clean
 help:
 	@sed -n 's/^# make /make /p' Makefile

@@ -21,6 +21,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import Jobs, names_of
+from starhil.emulator.errors import EmulatorError
 from starhil.protocol.files.bundled import bundled_units
 from starid.cli.options import AsJson
 
@@ -108,10 +109,18 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
     from rich.console import Console
     from rich.progress import Progress
 
+    context = get_context("spawn")
+    try:
+        context.Lock()
+    except OSError as error:
+        raise EmulatorError(
+            f"endurance: its processes need POSIX semaphores, which are not available ({error.strerror}): "
+            "mount a tmpfs on /dev/shm"
+        ) from None
     begin, lives = time.monotonic(), plan.plan()
     limit_s = None if plan.hours is None else plan.hours * 3600.0
     with (
-        ProcessPoolExecutor(plan.jobs, mp_context=get_context("spawn")) as pool,
+        ProcessPoolExecutor(plan.jobs, mp_context=context) as pool,
         Progress(console=Console(stderr=True)) as progress,
     ):
         task = progress.add_task("endurance", total=limit_s or plan.lives)
@@ -238,7 +247,6 @@ def _write(path: Path, text: str) -> None:
 
 def read_life(path: Path) -> Any:
     """Read a life that `write_life` has written."""
-    from starhil.emulator.errors import EmulatorError
     from starhil.hil_tests.endurance.life import Life
     from starhil.protocol.files.user_file import read_user_text
 

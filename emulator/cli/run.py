@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import importlib
 import logging
 import signal
 from collections.abc import Callable, Sequence
@@ -203,6 +204,8 @@ class AroundOptions:
         for path, option in ((self.truth_log, "--truth-log"), *((file, "--record") for file in files)):
             if path is not None:
                 prepare_output(path, option)
+        for file in files:  # what an extra installs is missing before anything starts
+            importlib.import_module(RECORDERS[file.suffix].needs)
         return RunOptions(
             truth_log=self.truth_log,
             overwrite=self.overwrite,

@@ -31,6 +31,8 @@ class RecorderKind:
 
     use: str
     """What the file is for, in the help of the option."""
+    needs: str
+    """Module of another package that it needs, which an extra installs."""
     make: Callable[[Head, ObcConnection, Path, bool], FileRecorder]
     """Makes a recorder for a head, with an OBC on its bus; the flag is whether an existing file is replaced."""
 
@@ -41,4 +43,6 @@ def _mcap(head: Head, client: ObcConnection, path: Path, overwrite: bool) -> Fil
     return McapRecorder(head, client, path, overwrite=overwrite)
 
 
-RECORDERS: Final[Mapping[str, RecorderKind]] = {".mcap": RecorderKind("for Foxglove", _mcap)}
+RECORDERS: Final[Mapping[str, RecorderKind]] = {
+    ".mcap": RecorderKind("for Foxglove; extra `mcap`", "mcap.writer", _mcap)
+}

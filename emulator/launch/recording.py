@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -13,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.errors import EmulatorError, explained
+from starhil.emulator.launch.machine import description
 from starhil.emulator.profile import Profile
 from starhil.emulator.profile.profile import PATHS
 from starhil.emulator.run.recorder import (
@@ -37,6 +39,8 @@ class _RunFile(BaseModel):
     profile: Profile
     ends: bool = False
     """Whether the tape of a complete run ends with the entry `end`: not if an older version recorded it."""
+    machine: dict[str, str] = {}
+    """Processor and versions of libraries, see `machine.description`; empty if an older version recorded it."""
 
 
 def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
@@ -73,6 +77,7 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
         (folder / SCENARIO_FILE).write_text(text, encoding="utf-8")
     run = {
         "starhil": importlib.metadata.version("starhil"),
+        "machine": description(),
         "folder": str(profile.folder.resolve()),
         "profile": values,
         "ends": True,
@@ -88,8 +93,19 @@ def _table_of(values: dict[str, Any], keys: Sequence[str]) -> tuple[dict[str, An
     return values, last
 
 
-def read_run(folder: Path) -> tuple[Profile, bool]:
-    """Return the profile of a recording, and whether its tape ends with the entry `end`."""
+@dataclass(frozen=True)
+class RecordedRun:
+    """What is known of a recorded run beside its tape."""
+
+    profile: Profile
+    ends: bool
+    """Whether its tape ends with the entry `end`."""
+    machine: Mapping[str, str]
+    """Machine on which it was recorded."""
+
+
+def read_run(folder: Path) -> RecordedRun:
+    """Return the profile of a recording, and what else its `run.json` has."""
     path = folder / RUN_FILE
     try:
         text = read_recorded(path)
@@ -102,7 +118,7 @@ def read_run(folder: Path) -> tuple[Profile, bool]:
         if table.get(key) == name:
             table[key] = str((folder / name).absolute())
     profile = Profile.model_validate(values)
-    return profile.read_from(Path(run.folder) / RUN_FILE), run.ends
+    return RecordedRun(profile.read_from(Path(run.folder) / RUN_FILE), run.ends, run.machine)
 
 
 def read_recorded(path: Path) -> str:

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from starhil.emulator.control.scenario import Scenario
 from starhil.emulator.device.device import Background, outcome
 from starhil.emulator.errors import EmulatorError, explained
+from starhil.emulator.launch.machine import other_machine
 from starhil.emulator.launch.recording import read_recorded, read_run, validated
 from starhil.emulator.launch.replay_differences import difference_of_truth, difference_sent, units_sent
 from starhil.emulator.links.traffic import Decoder, WireItem
@@ -184,7 +185,10 @@ class ReplayReport:
     sent: dict[str, int] = field(default_factory=dict)
     """Number of serial bytes or CAN frames sent, by link."""
     differences: list[str] = field(default_factory=list)
-    """One line for each link or file that differs, is missing or is truncated; empty if all are identical."""
+    """One line for each link or file that differs, is missing or is truncated, and one if the recording is of another machine.
+
+    Empty if all are identical.
+    """
 
 
 def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
@@ -210,7 +214,8 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
     The device may have another profile than the recorded one; `run` except the algorithm, and `links`, are as
     recorded.
     """
-    recorded, ends = read_run(folder)
+    recording_of = read_run(folder)
+    recorded = recording_of.profile
     player = Player(ends_at_once=recorded.run.clock == "stepped")
     report = ReplayReport()
     with tempfile.TemporaryDirectory(prefix="starhil-replay-") as scratch:
@@ -239,7 +244,7 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
             if pipeline is None:
                 raise EmulatorError("replay: the run has no pipeline")
             play = _Playing(again, head, player, pipeline, await head.imager.start())
-            recording = await play.entries(folder, report, ends=ends)
+            recording = await play.entries(folder, report, ends=recording_of.ends)
             to_the_end = not report.differences
             new_decoder = partial(Decoder, head.icd, head.serial_dialect)
             for link in sorted({each.bus for each in recording} | set(player.receivers)):
@@ -254,6 +259,8 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
             log.close()
         if difference := difference_of_truth(folder / TRUTH_FILE, truth_log, to_the_end=to_the_end):
             report.differences.append(difference)
+    if report.differences and (machine := other_machine(recording_of.machine)):
+        report.differences.append(machine)
     return report
 
 

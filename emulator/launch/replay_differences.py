@@ -11,7 +11,7 @@ from typing import Any
 
 from starhil.emulator.errors import explained
 from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
-from starhil.emulator.run.truth_log import WALL_TIMES
+from starhil.emulator.run.truth_log import WALL_TIMES, equal_cells
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.files.user_file import open_user_file
 from starhil.protocol.messages import Reply, ReplyKind
@@ -155,14 +155,15 @@ def _unit_difference(before: list[Any], now: list[Any]) -> str:
 
 
 def difference_of_truth(recorded: Path, now: Path, *, to_the_end: bool) -> str:
-    """Compare truth logs, except for wall times; return the difference, empty for none."""
+    """Compare truth logs to their resolution, except for wall times; return the difference, empty for none."""
     if not recorded.exists():
         return f"{recorded}: missing"
     before, after = (_rows(path) for path in (recorded, now))
     for number, (one, other) in enumerate(zip(before, after, strict=False), start=1):
-        changed = [name for name in one if name not in WALL_TIMES and one[name] != other.get(name)]
-        if changed:
-            return f"truth log: row {number} differs in {changed[0]}"
+        for name in one:
+            if name not in WALL_TIMES and not equal_cells(name, one[name], other.get(name, "")):
+                was, is_now = one[name], other.get(name, "")
+                return f"truth log: row {number} differs in {name}: recorded {was!r}, now {is_now!r}"
     if to_the_end and len(before) != len(after):
         return f"truth log: {len(before)} rows recorded, {len(after)} now"
     return ""

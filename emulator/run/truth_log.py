@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
@@ -30,6 +31,41 @@ are wall times; they are empty on the stepped clock, so that the same run gives 
 """
 
 WALL_TIMES: Final = ("processing_ms", "render_ms", "detect_ms", "identify_ms")
+
+
+_DIGITS: Final = 6
+"""Significant digits of a float, except in columns that are written exactly."""
+
+
+def _is_exact(name: str) -> bool:
+    """Return whether the floats of a column are written with all digits: quaternions and simulation times."""
+    return (
+        name.startswith(("true_q", "measured_q")) or name.endswith("time_s") or name == "time_of_exposure_s"
+    )
+
+
+def resolution(name: str) -> float:
+    """Return the resolution of a computed column, in its unit; 0 for one whose values are exactly defined.
+
+    Two machines may differ by less, because their C libraries round sines and exponentials differently.
+    """
+    if name.startswith(("true_q", "measured_q")):
+        return 1e-10  # 0.00004 arcseconds
+    if name.endswith("_deg_s"):
+        return 1e-7
+    return 1e-4 if name.endswith("_arcsec") else 1e-6 if name == "rms_px" else 0.0
+
+
+def equal_cells(name: str, one: str, other: str) -> bool:
+    """Return whether two cells of a column are equal to its resolution, or to one unit of their last digit."""
+    step = resolution(name)
+    if one == other or not step:
+        return one == other
+    try:
+        values = float(one), float(other)
+    except (TypeError, ValueError):
+        return False
+    return math.isclose(*values, rel_tol=0.0 if _is_exact(name) else 10.0 ** (1 - _DIGITS), abs_tol=step)
 
 
 def compare(measurement: Measurement) -> dict[str, Any]:
@@ -111,10 +147,5 @@ def _format_cell(name: str, value: Any) -> str:
     if isinstance(value, bool):
         return str(int(value))
     if isinstance(value, float):
-        exact = (
-            name.startswith(("true_q", "measured_q"))
-            or name.endswith("time_s")
-            or name == "time_of_exposure_s"
-        )
-        return repr(value) if exact else f"{value:.6g}"
+        return repr(value) if _is_exact(name) else f"{value:.{_DIGITS}g}"
     return str(value)

@@ -32,7 +32,8 @@ SETTLE_S: Final = 0.05
 class AsyncObcClient:
     """An OBC on one link to one device, with one request at a time.
 
-    `timeout_s` and `retries` (after a time-out) are defaults; with no retries, the bench sees every lost reply.
+    `timeout_s` and `retries` (after a time-out, or a row of another length) are defaults; with no retries, the bench sees
+    every lost reply.
     """
 
     def __init__(
@@ -219,9 +220,9 @@ class AsyncObcClient:
         limit = self.timeout_s if timeout_s is None else timeout_s
         attempts = 1 + (self.retries if retries is None else retries)
         async with self._turn:
-            for _ in range(attempts):
+            for left in reversed(range(attempts)):
                 answer = await self._attempt(request, limit)
-                if answer is not None:
+                if answer is not None and not (left and self._is_incomplete(answer[0])):
                     return self._checked_reply(name, *answer)
                 self.transactions.append(Transaction(name, "no_reply", float("inf")))
         self.link.check()
@@ -242,6 +243,14 @@ class AsyncObcClient:
             return None
         finally:
             self._pending = None
+
+    def _is_incomplete(self, reply: Reply) -> bool:
+        """Return whether a row has another length than in the definition, as after its first segment on CAN was lost.
+
+        Segments count down, so that the next one looks like the first of a shorter message.
+        """
+        row = self._row_of(reply)
+        return row is not None and reply.kind is ReplyKind.TELEMETRY and len(reply.data) != row.size
 
     def _checked_reply(self, name: str, reply: Reply, latency: float) -> tuple[Reply, float]:
         if reply.kind is not ReplyKind.NACK:

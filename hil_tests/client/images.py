@@ -13,6 +13,7 @@ from typing import Any, Final
 from starhil.hil_tests.client.async_client import AsyncObcClient
 from starhil.hil_tests.client.transactions import Reading
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd.values import Value
 from starhil.protocol.image_transfer import (
     FRAME_SIZE,
@@ -215,14 +216,21 @@ async def _download_block(
 
 
 async def _gather(client: AsyncObcClient, packets: dict[int, bytes], count: int) -> None:
-    """Receive burst packets until all have arrived or the line is silent."""
+    """Receive burst packets until all have arrived or the line is silent.
+
+    A message of another length is a damaged packet, which counts as lost: segments on CAN count down, so where the
+    first one is lost, the next one looks like the first of a shorter message.
+    """
     while len(packets) < count:
         try:
             async with asyncio.timeout(BURST_SILENCE_S):
                 packet = await client.bursts.get()
         except TimeoutError:
             return
-        number, data = parse_burst_packet(packet)
+        try:
+            number, data = parse_burst_packet(packet)
+        except ProtocolError:
+            continue
         if number < count:
             packets[number] = data
 

@@ -137,7 +137,8 @@ class PtyTransport(PacedTransport):
             self._master, slave = os.openpty()
         except OSError as error:
             raise TransportError(
-                f"serial pty: the system has no free pseudo-terminal: {error.strerror}"
+                f"serial pty: no pseudo-terminal is available ({error.strerror}): mount devpts on /dev/pts, "
+                "name a serial port, or do without it (--serial off)"
             ) from None
         try:
             with termios_as_os_error():

@@ -32,8 +32,8 @@ EXIT_INTERRUPTED: Final = 130
 USAGE_ERROR: Final[type[Exception]] = typer.BadParameter.__mro__[1]
 """Base class of errors about options; which library defines it depends on typer's version."""
 
-LAB_PACKAGES: Final = ("joblib", "matplotlib", "sklearn")
-"""Packages of the extra `lab`."""
+EXTRAS: Final = {**dict.fromkeys(("joblib", "matplotlib", "sklearn"), "lab"), "mcap": "mcap"}
+"""Package → extra of the installation that brings it."""
 
 
 _PYTHON_NUMBERS: Final = "starhil.python_numbers"
@@ -199,6 +199,13 @@ def run(
         Errors whose text is one line for the user, or that have several such lines as `problems`.
     """
     show_every_character()
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in (
+        "",
+        "0",
+    ):  # a kernel in Python takes minutes for an image
+        exit_for_bad_input(
+            program, "NUMBA_DISABLE_JIT is set: images are only made and solved by compiled kernels; unset it"
+        )
     try:
         status = build(words or words_to_complete())(
             args=list(words), prog_name=program, standalone_mode=False
@@ -206,9 +213,11 @@ def run(
     except errors as error:
         exit_for_bad_input(program, *getattr(error, "problems", (str(error),)))
     except ModuleNotFoundError as error:
-        if error.name not in LAB_PACKAGES:
+        package = str(error.name).partition(".")[0]
+        if package not in EXTRAS:
             raise
-        exit_for_bad_input(program, f"{error.name} is not installed; run: pip install 'starhil[lab]'")
+        extra = f"pip install 'starhil[{EXTRAS[package]}]'"
+        exit_for_bad_input(program, f"{package} is not installed; run: {extra}")
     except OSError as error:
         exit_for_bad_input(program, describe_os_error(error))
     except MemoryError as error:

@@ -21,6 +21,9 @@ from typing import BinaryIO, Final
 
 MEGABYTE: Final = 1_000_000
 
+_OPEN: Final = sum(getattr(os, name, 0) for name in ("O_RDONLY", "O_NONBLOCK", "O_CLOEXEC", "O_BINARY"))
+"""Flags with which a file is opened for reading; no system has all of them."""
+
 STDOUT: Final = 1
 """File descriptor of standard output."""
 
@@ -39,7 +42,7 @@ def open_regular(path: str | Path) -> BinaryIO:
         The file cannot be opened, or is a folder, device, pipe or socket.
     """
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        descriptor = os.open(path, _OPEN)
     except ValueError as error:  # not a valid file name
         raise OSError(errno.EINVAL, str(error), str(path)) from None
     mode = os.fstat(descriptor).st_mode

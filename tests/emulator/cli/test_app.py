@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from starhil.emulator.cli import app
+from tests.emulator.cli.command_line import run_command_line
 
 
 @pytest.mark.parametrize(
@@ -40,6 +42,18 @@ def test_an_operating_system_error_is_one_line_and_status_2(
     printed = capsys.readouterr()
     assert caught.value.code == 2
     assert (printed.out, printed.err) == ("", f"starhil: {said}\n")
+
+
+def test_a_recording_without_the_package_of_its_extra_is_rejected_before_the_start(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "mcap", None)  # as if it were not installed
+    monkeypatch.delitem(sys.modules, "mcap.writer", raising=False)
+    status, out, err = run_command_line(
+        "run", "--record", str(tmp_path / "run.mcap"), "--serial", "off", "--can", "off"
+    )
+    assert (status, out) == (2, "")
+    assert err == "starhil: mcap is not installed; run: pip install 'starhil[mcap]'\n"
 
 
 @pytest.mark.parametrize("name", ["", ".", ".."])

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import csv
 import json
 import os
+import platform
 import re
 
 import pytest
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.launch import RunOptions
+from starhil.emulator.launch import RunOptions, machine
 from starhil.emulator.launch.recording import prepare_recording, read_run
 from starhil.emulator.launch.replay import replay
 from starhil.emulator.profile import Profile, load_profile
@@ -105,7 +107,7 @@ def test_runs_with_other_state_folders_are_recorded_alike(tmp_path):
         prepare_recording(folder, Profile(run={"state_dir": str(tmp_path / name)}), "")
         written.append((folder / RUN_FILE).read_bytes())
     assert written[0] == written[1]
-    assert read_run(folder)[0].run.state_dir == "state"
+    assert read_run(folder).profile.run.state_dir == "state"
 
 
 def test_can_frames_and_canopen_are_repeated(record):
@@ -395,6 +397,60 @@ def test_a_missing_truth_log_is_a_difference(record):
     assert report_of(folder).differences == [f"{folder / 'truth.csv'}: missing"]
 
 
+def changed_cell(folder, column, change):
+    """Change the last cell of a column of the truth log by a function of its number."""
+    path = folder / TRUTH_FILE
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    row = [row for row in rows if row[column]][-1]
+    row[column] = repr(change(float(row[column])))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+@pytest.mark.parametrize(
+    ("column", "change", "is_named"),
+    [
+        ("measured_qx", lambda value: value + 4e-12, False),
+        ("measured_qx", lambda value: value + 4e-10, True),
+        ("true_wx_deg_s", lambda value: value + 1e-9, False),
+        ("true_wx_deg_s", lambda value: value + 1e-3, True),
+        ("cross_boresight_arcsec", lambda value: value * 1.00001, False),
+        ("cross_boresight_arcsec", lambda value: value * 1.001 + 1e-3, True),
+        ("run_time_s", lambda value: value + 1e-9, True),
+        ("stars_matched", lambda value: int(value) + 1, True),
+    ],
+)
+def test_a_truth_log_is_compared_to_its_resolution_and_a_difference_names_the_machine(
+    record, column, change, is_named
+):
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    folder = record(scenario)
+    run = json.loads((folder / RUN_FILE).read_text())
+    assert set(run["machine"]) == {"processor", "python", "numpy", "numba", "libc"}
+    run["machine"]["libc"] = "musl 9"
+    (folder / RUN_FILE).write_text(json.dumps(run))
+    assert report_of(folder).differences == []
+    changed_cell(folder, column, change)
+    found = report_of(folder).differences
+    if is_named:
+        difference, machine = found
+        assert re.match(rf"truth log: row \d+ differs in {column}: recorded ", difference)
+        assert re.fullmatch(r"recorded on another machine: libc musl 9 \(here .+\)", machine)
+    else:
+        assert found == []
+
+
+def test_a_machine_without_a_description_of_its_processor_is_named_by_its_architecture(monkeypatch, tmp_path):
+    monkeypatch.setattr(machine, "PROCESSOR_FILE", tmp_path / "cpuinfo")
+    monkeypatch.setenv("NUMBA_CPU_NAME", "generic")
+    assert machine.description()["processor"] == f"{platform.machine()}, kernels for generic"
+
+
 @pytest.mark.parametrize(
     ("override", "said"),
     [
@@ -613,7 +669,7 @@ def test_paths_of_the_profile_refer_to_its_folder_and_the_copied_truth_to_the_re
         '[truth]\nkind = "file"\npath = "truth.csv"\n[catalog]\npath = "hip.dat"\n[images]\nfolder = "sky"\n'
     )
     prepare_recording(folder, load_profile(str(site / "mine.toml")), "")
-    profile, _ = read_run(folder)
+    profile = read_run(folder).profile
     paths = (profile.catalog.path, profile.images.folder, profile.truth.path)
     assert [profile.folder / path for path in paths] == [
         site / "hip.dat",

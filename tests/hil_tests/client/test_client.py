@@ -13,10 +13,11 @@ from starhil.hil_tests.client.canopen_link import CanopenHostLink
 from starhil.hil_tests.client.images import list_files
 from starhil.hil_tests.client.raw_traffic import parse_frame, send_and_listen
 from starhil.hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
+from starhil.protocol.can.cubespace import CanHostReceiver, encode_reply_frames
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import FieldError, UnknownNameError
-from starhil.protocol.messages import ErrorCode
+from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.unit import load_unit
@@ -140,6 +141,41 @@ def test_no_reply_is_an_error_after_the_timeout_and_is_retried_only_if_asked(pai
     assert [item.outcome for item in client.transactions] == ["no_reply"] * 3 + ["ok"] + ["no_reply"] * 2 + [
         "ok"
     ]
+
+
+class CanThatLosesAFrame:
+    """A link to a device on CAN that loses the nth frame of its first reply."""
+
+    def __init__(self, lost: int) -> None:
+        self.lost, self.receiver = lost, CanHostReceiver(1, 4)
+        self.on_reply = self.on_fault = lambda _event: None
+
+    def request(self, request: Request) -> None:
+        data = load_unit().telemetry["precise_attitude"].encode({"q_w": 1.0})
+        frames = encode_reply_frames(Reply(ReplyKind.TELEMETRY, request.id, data, destination=1), 4)
+        lost, self.lost = self.lost, -1
+        for number, frame in enumerate(frames):
+            for event in self.receiver.feed(frame, 0.0) if number != lost else ():
+                (self.on_fault if isinstance(event, LinkFault) else self.on_reply)(event)
+
+    def reset_receiver(self) -> None:
+        self.receiver = CanHostReceiver(1, 4)
+
+    def check(self) -> None:
+        """Nothing is wrong."""
+
+
+@pytest.mark.parametrize("lost", [0, 1, -2], ids=["first", "second", "none"])
+def test_a_row_of_which_a_can_frame_was_lost_is_requested_again(lost):
+    client = AsyncObcClient(CanThatLosesAFrame(lost), load_unit(), timeout_s=TIMEOUT_S, retries=1)
+    assert asyncio.run(client.read("precise_attitude"))["q_w"] == 1.0
+    assert [item.outcome for item in client.transactions] == ["no_reply"] * (lost >= 0) + ["ok"]
+
+
+def test_without_retries_a_row_of_another_length_is_reported():
+    client = AsyncObcClient(CanThatLosesAFrame(0), load_unit(), timeout_s=TIMEOUT_S)
+    with pytest.raises(BadReplyError, match="precise_attitude"):
+        asyncio.run(client.read("precise_attitude"))
 
 
 def test_a_late_reply_does_not_answer_the_next_request(pair):

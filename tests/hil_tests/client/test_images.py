@@ -14,8 +14,9 @@ from starhil.hil_tests.client import AsyncObcClient, images
 from starhil.hil_tests.client.images import download_by_bursts, download_by_frames, list_files
 from starhil.hil_tests.client.transactions import Reading
 from starhil.hil_tests.errors import BenchError, NackError
+from starhil.protocol.can.cubespace import CanHostReceiver, encode_reply_frames
 from starhil.protocol.image_transfer import burst_packet, file_checksum, frame_checksum, packet_count
-from starhil.protocol.messages import ErrorCode
+from starhil.protocol.messages import BURST_ID, ErrorCode, Reply, ReplyKind
 
 PIXELS = np.arange(64 * 64, dtype=np.uint8).reshape(64, 64)
 FILE = cv2.imencode(".bmp", PIXELS)[1].tobytes()
@@ -90,6 +91,38 @@ def test_a_frame_with_a_wrong_checksum_is_read_again():
 
 def test_packets_that_were_lost_are_requested_again():
     image = asyncio.run(download_by_bursts(Device(lost=(0, 7, 100)), "size_64", within_s=5.0))
+    assert (image.pixels, image.repeats) == (PIXELS.tobytes(), 1)
+
+
+class LossyCanDevice(Device):
+    """The device on a CAN bus that loses some frames of the first burst, counted from its begin."""
+
+    def __init__(self, lost_frames: tuple[int, ...]) -> None:
+        super().__init__()
+        self.lost_frames = set(lost_frames)
+
+    async def command(self, name: str, values: Mapping[str, Any] | None = None) -> None:
+        await super().command(name, values)
+        if name != "start_burst":
+            return
+        packets = [self.bursts.get_nowait() for _ in range(self.bursts.qsize())]
+        frames = [
+            frame
+            for packet in packets
+            for frame in encode_reply_frames(Reply(ReplyKind.BURST, BURST_ID, packet, destination=1), 4)
+        ]
+        receiver = CanHostReceiver(1, 4)
+        for number, frame in enumerate(frames):
+            for event in receiver.feed(frame, 0.0) if number not in self.lost_frames else ():
+                if isinstance(event, Reply):
+                    self.bursts.put_nowait(event.data)
+        self.lost_frames.clear()
+
+
+@pytest.mark.parametrize("place", range(4), ids=("first", "second", "third", "last"))
+def test_a_lost_can_frame_costs_its_packet_not_the_download(place):
+    device = LossyCanDevice((4 * 7 + place, 4 * 100 + place))
+    image = asyncio.run(download_by_bursts(device, "size_64", within_s=5.0))
     assert (image.pixels, image.repeats) == (PIXELS.tobytes(), 1)
 
 

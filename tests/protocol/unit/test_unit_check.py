@@ -156,14 +156,13 @@ def elsewhere(folder: Path, place: str) -> str:
     (folder / "sub").mkdir()
     (folder / "sub" / "unit.py").write_text(outside.read_text(encoding="utf-8"), encoding="utf-8")
     (folder / "link.py").symlink_to(outside)
-    (folder / "loop.py").symlink_to("loop.py")
     (folder / "linked").symlink_to(folder.parent)
     return {"absolute": str(outside)}.get(place, place)
 
 
 @pytest.mark.parametrize(
     "place",
-    ["../outside.py", "absolute", "sub/unit.py", "sub/../unit.py", "linked/outside.py", "link.py", "loop.py", ".", "..", ""],
+    ["../outside.py", "absolute", "sub/unit.py", "sub/../unit.py", "linked/outside.py", "link.py", ".", "..", ""],
 )  # fmt: skip
 def test_a_plugin_is_a_file_beside_the_definition(tmp_path: Path, place: str) -> None:
     folder = tmp_path / "unit"
@@ -171,6 +170,13 @@ def test_a_plugin_is_a_file_beside_the_definition(tmp_path: Path, place: str) ->
     name = elsewhere(folder, place)
     (folder / "unit.toml").write_text(HEAD + f'plugin = "{name}"\n' + ROW, encoding="utf-8")
     with pytest.raises(IcdError, match=r"unit\.toml: unit\.plugin: .* a file beside the definition"):
+        load_unit(folder)
+
+
+def test_a_plugin_that_is_a_loop_of_links_cannot_be_read(tmp_path: Path) -> None:
+    folder = written(tmp_path, plugin=None)
+    (folder / "unit.py").symlink_to("unit.py")
+    with pytest.raises(IcdError, match=r"unit\.py: cannot be read: Too many levels of symbolic links"):
         load_unit(folder)
 
 
