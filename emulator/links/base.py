@@ -157,10 +157,10 @@ class RequestLink(Link[Item], Generic[Item, Style]):
             self._executing = False
         caused, self._caused = self._caused, []
         if isinstance(answer, PendingAnswer):
-            self._pending = answer
+            self._pending = answer = answer.then(lambda replies: replies if event.polled else [])
             answer.when_done(partial(self._answer_later, answer, caused, style))
         else:
-            self._answer(answer, caused, style)
+            self._answer(answer if event.polled else [], caused, style)
 
     def _answer_later(
         self, answer: PendingAnswer[list[Reply]], caused: list[Reply], style: Style, replies: list[Reply]
