@@ -198,11 +198,11 @@ def edac(state: Sequence, shot: Any) -> bytes:
     return bytes(memory)
 
 
-def part_of(memory: bytes, address: int, count: int) -> bytes:
+def part_of(memory: bytes | bytearray, address: int, count: int) -> bytes:
     """Return bytes of a memory; refuse those beyond its end."""
     if address + count > len(memory):
         raise refused("address")
-    return memory[address : address + count]
+    return bytes(memory[address : address + count])
 
 
 def count_of(arguments: Mapping[str, Any]) -> int:
@@ -314,10 +314,10 @@ def combination(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
 @quantity("time.low", unit="us", doc="Lower 32 bits of the count of microseconds since start.")
 def time_low(shot: Any) -> int:
     """Return bits 0 to 31 of TIME."""
-    return shot.uptime_ns // 1000 & 0xFFFFFFFF
+    return int(shot.uptime_ns // 1000 & 0xFFFFFFFF)
 
 
 @quantity("time.high", doc="Upper 16 bits of the count of microseconds since start.")
 def time_high(shot: Any) -> int:
     """Return bits 32 to 47 of TIME."""
-    return shot.uptime_ns // 1000 >> 32 & 0xFFFF
+    return int(shot.uptime_ns // 1000 >> 32 & 0xFFFF)
