@@ -74,6 +74,8 @@ class FaultKind(Enum):
     """A message began and did not end."""
     UART_OVERLONG = "uart_overlong"
     """A message longer than the receiver accepts."""
+    UART_SHORT = "uart_short"
+    """A message shorter than header and check."""
     UART_CHECK = "uart_check"
     """A message with a wrong check."""
     UART_ADDRESS = "uart_address"
@@ -106,6 +108,8 @@ class Request:
     """Sequence number in the header, if any; the reply repeats it."""
     flags: int = 0
     """Flags in the header, if any; the reply repeats them."""
+    polled: bool = True
+    """Whether the request is answered; otherwise it is only executed."""
 
     @classmethod
     def of(cls, row_id: int, data: bytes = b"", source: int = 0) -> Request:

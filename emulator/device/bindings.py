@@ -155,7 +155,8 @@ class TelecommandBinding:
         values = self.row.decode(self._without_crc(data))
         arguments = dict(self._fixed)
         for name, argument, convert in self._arguments:
-            arguments[argument] = convert(values[name])
+            if name in values:  # else the data ended before it
+                arguments[argument] = convert(values[name])
         arguments[PARAMETERS] = {parameter: values[name] for name, parameter in self._parameters}
         try:
             outcome = self._action(device, arguments)

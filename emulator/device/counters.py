@@ -13,6 +13,7 @@ _FLAG_OF_FAULT: Final[dict[FaultKind, str]] = {
     FaultKind.UART_PROTOCOL: "uart_protocol_error",
     FaultKind.UART_OVERLONG: "uart_protocol_error",
     FaultKind.UART_INCOMPLETE: "uart_incomplete",
+    FaultKind.UART_SHORT: "uart_protocol_error",
     FaultKind.UART_CHECK: "uart_check_error",
     FaultKind.UART_ADDRESS: "uart_address_error",
     FaultKind.CAN_SEQUENCE: "can_telecommand_error",

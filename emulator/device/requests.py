@@ -69,7 +69,7 @@ class Requests:
             return outcome.then(lambda code: self._acknowledge(request, row, code, device.snapshot()))
         code, replies = outcome
         shot = device.snapshot()
-        answered = self._answers_with_data(request, replies, shot) or self._acknowledge(
+        answered = self._answers_with_data(request, replies, shot, code) or self._acknowledge(
             request, row, code, shot
         )
         following = [replace(item, destination=request.source) for item in replies if item.id is not None]
@@ -116,11 +116,14 @@ class Requests:
                 replies.append(self._answer_telemetry(as_request, other, shot))
         return [replace(item, final=item is replies[-1]) for item in replies]
 
-    def _answers_with_data(self, request: Request, replies: Sequence[Reply], shot: Snapshot) -> list[Reply]:
+    def _answers_with_data(
+        self, request: Request, replies: Sequence[Reply], shot: Snapshot, code: ErrorCode
+    ) -> list[Reply]:
         """Return answers with data made by an action of a plugin, which are marked by having no ID."""
         data = [reply.data for reply in replies if reply.id is None]
+        kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
         return [
-            replace(self._reply(request, shot, ReplyKind.ACK, item), final=number == len(data))
+            replace(self._reply(request, shot, kind, item, code), final=number == len(data))
             for number, item in enumerate(data, 1)
         ]
 
@@ -181,9 +184,12 @@ class Requests:
             return ErrorCode.INVALID_ID, []
         try:
             outcome = self.telecommand_bindings[row.name].execute(device, request.data)
-        except (Refused, MessageError) as refused:
+        except MessageError as wrong:
+            end(wrong.code, wrong.index)
+            return wrong.code, []
+        except Refused as refused:
             end(refused.code, refused.index)
-            return refused.code, []
+            return refused.code, [Reply(ReplyKind.NACK, None, refused.data)] if refused.data else []
         except Exception as error:  # noqa: BLE001 (the OBC always gets an answer)
             log_internal_error(f"telecommand {request.id}", error)
             end(ErrorCode.INTERNAL)

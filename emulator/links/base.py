@@ -227,10 +227,11 @@ class RequestLink(Link[Item], Generic[Item, Style]):
             exchange.advance(Turn.ANSWERED)
             raise
         if isinstance(answer, PendingAnswer):
+            answer = answer.then(lambda replies: replies if event.polled else [])
             exchange.advance(Turn.DELAYED)
             answer.when_done(partial(self._answer_later, exchange))
         else:
-            self._answer(exchange, answer)
+            self._answer(exchange, answer if event.polled else [])
 
     def _answer_later(self, exchange: Exchange[Style], replies: list[Reply]) -> None:
         self._answer(exchange, replies)

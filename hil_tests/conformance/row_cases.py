@@ -148,8 +148,8 @@ def _lengths(unit: Unit, sizes: Callable[[str], range]) -> Iterator[Case[LinkPro
         whole = row.encode()
         tried = {
             "long": whole + beyond,
-            "short": whole[:-1] if row.size else None,
-            "empty": b"" if row.size > 1 else None,
+            "short": whole[: row.min_size - 1] if row.min_size else None,
+            "empty": b"" if row.min_size > 1 else None,
         }
         for why, data in tried.items():
             if data is not None and len(data) in sizes(row.klass):

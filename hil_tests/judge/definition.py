@@ -223,7 +223,7 @@ def _parameter(item: Any) -> Parameter:
 def _row(row: Any, icd: InterfaceDefinition) -> Row:
     return Row(
         row.kind, row.id, row.name, tuple(_fields(row, icd)), row.klass, row.provenance, row.source, row.action, row.arguments,
-        row.answers, row.request, row.unsolicited, row.only_sent,
+        row.answers, row.request, row.unsolicited, row.only_sent, row.min_size,
     )  # fmt: skip
 
 

@@ -284,6 +284,8 @@ class Row:
         Rate in Hz at which it is sent without a request, or events after which it is sent; None if it is not.
     only_sent
         Whether no request reads it.
+    min_size
+        Fewest bytes of data, if a telecommand's data may end early.
     """
 
     kind: RowKind
@@ -299,6 +301,7 @@ class Row:
     request: str = ""
     unsolicited: float | Sequence[str] | None = None
     only_sent: bool = False
+    min_size: int = 0
 
     def __repr__(self) -> str:
         return f"Row({self.kind} {self.id} {self.name})"

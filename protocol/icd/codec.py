@@ -363,6 +363,8 @@ class Row(RowKeys):
     kind: RequestKind
     size: int
     """Bytes of data."""
+    min_size: int
+    """Fewest bytes of data; less than `size` only in a telecommand whose data may end early."""
     fields: tuple[Field, ...]
     """All fields in wire order, unused ones included."""
     slots: tuple[Slot, ...]
@@ -456,10 +458,13 @@ class Row(RowKeys):
         """Decode the bytes of the row to physical values by name.
 
         With `check`, a value outside the limits raises FieldError. By default, telecommands are checked and
-        telemetry is not, so that the OBC sees what arrived. A wrong length always raises LengthError.
+        telemetry is not, so that the OBC sees what arrived. A wrong length always raises LengthError. If the data end early,
+        missing and incomplete fields have no values, and a `bytes` field is cut.
         """
-        if len(data) != self.size:
-            raise LengthError(f"{self.kind} {self.name} ({self.id}): {len(data)} bytes, must be {self.size}")
+        if not self.min_size <= len(data) <= self.size:
+            wanted = f"{self.min_size} to {self.size}" if self.min_size < self.size else f"{self.size}"
+            raise LengthError(f"{self.kind} {self.name} ({self.id}): {len(data)} bytes, must be {wanted}")
+        given, data = len(data), data.ljust(self.size, b"\0")
         strict = self.kind == "telecommand" if check is None else check
         raw: list[Any] = []
         offset = 0
@@ -471,6 +476,10 @@ class Row(RowKeys):
         values: dict[str, Value] = {}
         for index, (name, item) in enumerate(self.named_fields.items()):
             number = raw[item.slot.index]
+            if item.slot.offset + item.slot.size > given:
+                if item.kind != "bytes" or item.slot.offset > given:
+                    continue
+                number = number[: given - item.slot.offset]
             if item.width:
                 number = number >> item.shift & (1 << item.width) - 1
             if strict:

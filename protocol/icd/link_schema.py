@@ -27,7 +27,7 @@ LineText = Annotated[str, Field(min_length=1, max_length=200, pattern="^[!-~]([ 
 """Printable ASCII without spaces at its ends."""
 Role = Literal[
     "address", "source", "destination", "class", "id", "sequence", "length",
-    "status", "ack", "final", "flags", "ticks", "time",
+    "status", "ack", "final", "poll", "flags", "ticks", "time",
 ]  # fmt: skip
 """Meaning of a header field; described in `HeaderFieldModel`."""
 CountedMessage = Literal["reply", "unsolicited"]
@@ -295,8 +295,8 @@ class HeaderFieldModel(DefinitionModel):
     Roles: `address` is the address of the device, in both directions; `source` (in a request) and
     `destination` (in a reply) are the address of the OBC. `class`, `id` and `status` are the codes of class,
     row and error. `length` is the number of bytes of the parts in `includes`, plus `offset`. `ack` is 0 in a refusal, otherwise 1; `final` is 1 in
-    the last reply to a request. A reply repeats the `sequence` and `flags` of its request. `ticks` is the
-    time since start, `time` the time of the unit's clock.
+    the last reply to a request. A request with `poll` 0 is executed and not answered; its `default` is 1. A reply repeats the
+    `sequence` and `flags` of its request. `ticks` is the time since start, `time` the time of the unit's clock.
     """
 
     role: Role | None = None

@@ -24,7 +24,7 @@ from starhil.protocol.icd.values import (
     bounded,
 )
 
-Provenance = Literal["confirmed", "proxy", "ours"]
+Provenance = Literal["confirmed", "copy", "proxy", "ours"]
 FieldType = Literal[
     "u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u64", "i64", "f32", "f64",
     "enum8", "enum16", "enum32", "bits8", "bits16", "bits32", "bytes", "text",
@@ -152,8 +152,8 @@ class RowKeys(DefinitionModel):
     doc: str
     """Description."""
     provenance: Provenance | None = None
-    """`confirmed`: from a public source; `proxy`: public for another unit of the family; `ours`: chosen here;
-    default: the unit's."""
+    """`confirmed`: from a public source; `copy`: from a public copy of the vendor's document, whose revision is not known;
+    `proxy`: public for another unit of the family; `ours`: chosen here; default: the unit's."""
     source: str = ""
     """Public source of the row."""
     action: str | None = None
@@ -179,6 +179,9 @@ class RowModel(RowKeys):
     """Class of the row; required if the unit has several classes of its kind."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Expected size of the data in bytes; the fields are checked against it."""
+    min_size: Annotated[int, Field(ge=0, le=4096)] | None = None
+    """Fewest bytes of a telecommand's data, if they may end early: the plugin's action gets no argument of a field that is missing
+    or incomplete, and a `bytes` field as far as it goes. Clients send all fields."""
     fields: list[FieldModel] = []
     """Fields in wire order, after the fields of `include`; each is a table or a string (`text`)."""
     include: list[str] | None = None

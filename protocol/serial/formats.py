@@ -68,16 +68,16 @@ class MessageFormat:
             if {"header", "data"} <= self.check.covers and not self._checks(body, 0, end):
                 return self._bad_check(body[end:])
             return LinkFault(FaultKind.UART_PROTOCOL, str(error))
-        if envelope is None:
-            return LinkFault(
-                FaultKind.UART_PROTOCOL, f"message of {len(body)} bytes is shorter than its header"
-            )
-        if not self._checks(body, envelope.size, end):
-            return self._bad_check(body[end:])
-        address = envelope.values.get("address")
+        address = header.address_in(body)
         if address is not None and address != header.defaults["address"]:
             text = f"message to address {address:#04x}, not {header.defaults['address']:#04x}"
             return LinkFault(FaultKind.UART_ADDRESS, text)
+        if envelope is None:
+            return LinkFault(
+                FaultKind.UART_SHORT, f"message of {len(body)} bytes is shorter than its header and check"
+            )
+        if not self._checks(body, envelope.size, end):
+            return self._bad_check(body[end:])
         found = end - envelope.size
         if "length" in header.roles and envelope.values["length"] != header.length(envelope.size, found):
             text = f"{found} bytes of data, but length {envelope.values['length']}"

@@ -164,6 +164,24 @@ class HeaderCodec:
             position = end
         return HeaderContent(values, position, klass)
 
+    def address_in(self, body: bytes) -> int | None:
+        """Return the address in a body, which may be incomplete or damaged; None if the header carries none in every message."""
+        position = 0
+        for role, size, order, _, _, _, classes, bits in self._steps:
+            if classes is not None:
+                return None
+            part = body[position : position + size]
+            if len(part) < size:
+                return None
+            value = int.from_bytes(part, order)
+            if role == "address":
+                return value
+            for name, shift, mask, _, _ in bits:
+                if name == "address":
+                    return value >> shift & mask
+            position += size
+        return None
+
     def data_size(self, envelope: HeaderContent) -> int:
         """Return the data size according to the length in a header.
 
@@ -185,6 +203,9 @@ def _check_field(model: HeaderFieldModel, where: str) -> None:
     counting = [bit.role for bit in model.bits if bit.counts] + [model.role] * bool(model.counts)
     if any(role != "sequence" for role in counting):
         raise IcdError(f"{where}: only role sequence has `counts`")
+    unpolled = [part for role, part in model.by_role.items() if role == "poll" and part.initial != 1]
+    if unpolled:
+        raise IcdError(f"{where}: role poll needs `default = 1`; otherwise no request would be answered")
     if model.offset and model.role != "length":
         raise IcdError(f"{where}: only role length has an `offset`")
     width = sum(bit.width for bit in model.bits)

@@ -180,6 +180,9 @@ class SerialStack:
                 raise IcdError(f"link.serial.{where}_header: framing length needs a field with role length")
         if self.requests.header.counts:
             raise IcdError("link.serial.request_header: `counts` belongs to the reply header")
+        early = next((row.name for row in self.rows if row.min_size < row.size), None)
+        if early is not None and any(form.model.kind == "fixed" for form in self.request_formats.all):
+            raise IcdError(f"link.serial: data of {early} may end early, which framing fixed cannot show")
         text_replies = [self.replies] if self.link.acknowledge or self.link.refusal else []
         for form in (*self.text_formats, *text_replies):
             if form.model.kind in ("length", "fixed"):
@@ -191,6 +194,7 @@ class SerialStack:
         directions = (
             ("source", "reply", self.replies.header),
             ("destination", "request", self.requests.header),
+            ("poll", "reply", self.replies.header),
         )
         for role, where, header in directions:
             if role in header.roles:
@@ -253,6 +257,8 @@ class SerialStack:
             values["source"] = request.source
         if request.flags:
             values["flags"] = request.flags
+        if not request.polled:
+            values["poll"] = 0
         if "class" in self.requests.header.roles:
             values["class"] = self._coded(request.klass).code or 0
         return form.close(form.header.pack(values, request.klass, len(request.data)), request.data)
@@ -297,9 +303,9 @@ class SerialStack:
             item = self._coded(reply.klass)
             unsolicited = reply.kind is ReplyKind.UNSOLICITED
             values["class"] = (item.unsolicited_code if unsolicited else item.reply_code) or 0
-        data = b"" if refused else reply.data
         form = self.reply_formats.of(reply.klass)
-        return form.framing.encode(form.close(form.header.pack(values, reply.klass, len(data)), data))
+        header_bytes = form.header.pack(values, reply.klass, len(reply.data))
+        return form.framing.encode(form.close(header_bytes, reply.data))
 
     def _request_of(self, form: MessageFormat, body: bytes) -> Request | LinkFault:
         if form in self.text_formats:
@@ -327,6 +333,7 @@ class SerialStack:
             klass,
             values.get("sequence", 0),
             values.get("flags", 0),
+            bool(values.get("poll", 1)),
         )
 
     def _request_size(self, form: MessageFormat, body: bytes) -> int | None:

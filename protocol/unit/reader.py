@@ -319,20 +319,27 @@ class _Reader:
             with self._recording(f"{file}: {kind} {model.name}", model.name):
                 self._expand_row(kind, file, model)
 
-    def _expand_row(self, kind: RequestKind, file: Path, model: schema.RowModel) -> None:
-        where = f"{file}: {kind} {model.name}"
-        provenance = model.provenance or self._unit.provenance
-        if provenance is None:
-            raise IcdError("needs `provenance`, here or in [unit]")
-        ids = self._ids_of(model)
+    def _check_kind(self, kind: RequestKind, model: schema.RowModel) -> None:
+        """Raise IcdError for a key that rows of this kind, or with this action, do not have."""
         if kind == "telecommand" and model.unsolicited is not None:
             raise IcdError("only telemetry is sent unsolicited")
         if kind == "telecommand" and model.request is False:
             raise IcdError("only telemetry is sent without a request; remove `request = false`")
         if kind == "telemetry" and model.readback is not None:
             raise IcdError("only telecommands have a readback")
+        plugin = self._icd.plugin
+        if model.min_size is not None and model.action not in plugin.actions and plugin.skipped is None:
+            raise IcdError("`min_size` needs a telecommand with an action of the unit's plugin")
         if model.readback is not None and not model.name.startswith(SETS):
             raise IcdError(f"the name of a telecommand with a readback must begin with {SETS}")
+
+    def _expand_row(self, kind: RequestKind, file: Path, model: schema.RowModel) -> None:
+        where = f"{file}: {kind} {model.name}"
+        provenance = model.provenance or self._unit.provenance
+        if provenance is None:
+            raise IcdError("needs `provenance`, here or in [unit]")
+        ids = self._ids_of(model)
+        self._check_kind(kind, model)
         of_kind = [item.name for item in self._classes.values() if item.kind is kind]
         klass = model.klass or next(iter(of_kind), "")
         with self._recording(where):
@@ -358,14 +365,15 @@ class _Reader:
             for item in model.fields:
                 with self._recording(where, model.name):
                     layout.add(item)
-            if model.size not in (None, layout.size) and model.name not in self._broken:
+            if model.name not in self._broken:
                 with self._recording(where, model.name):  # its ID and bindings can still be checked
-                    raise IcdError(f"size is {model.size} but the fields add up to {layout.size} bytes")
+                    _check_sizes(model, layout.size)
             row = Row.model_construct(
                 kind=kind,
                 id=row_id,
                 name=model.name if single else f"{model.name}_{number}",
                 size=layout.size,
+                min_size=layout.size if model.min_size is None else model.min_size,
                 fields=tuple(layout.fields),
                 slots=tuple(layout.slots),
                 doc=model.doc,
@@ -526,6 +534,13 @@ def check_text_request(row: Row, definition: InterfaceDefinition, *, needed: boo
     same = next(item for item in definition.rows if words(item.request) == words(row.request))
     if same is not row:
         raise IcdError(f"request {row.request!r} is already that of {same.name}")
+
+
+def _check_sizes(model: schema.RowModel, size: int) -> None:
+    if model.size not in (None, size):
+        raise IcdError(f"size is {model.size} but the fields add up to {size} bytes")
+    if model.min_size is not None and model.min_size > size:
+        raise IcdError(f"min_size is {model.min_size} but the fields add up to {size} bytes")
 
 
 def _readback(model: schema.RowModel) -> schema.RowModel:

@@ -47,6 +47,15 @@ def test_a_session_passes(name, links, tmp_path):
         assert [frame for frame in dissect(tmp_path / "can.log") if frame.malformed] == []
 
 
+def test_the_procedure_for_lissa_s_star_tracker_passes(tmp_path):
+    words = ("--unit", "st16", "--start", "--serial", "auto", "--log", tmp_path, "--json")
+    done = starhil("session", "st16_lissa", *words)
+    result = json.loads(done.stdout)
+    failed = [(item["step"], item["detail"]) for item in result["results"] if item["status"] == "failed"]
+    assert (done.stderr, done.returncode, failed) == ("", 0, [])
+    assert " TX C0 0E 11 92 2F 1E 00 00 " in (tmp_path / "serial.log").read_text()
+
+
 def test_a_session_whose_expectation_does_not_hold_ends_with_status_1(emulator, tmp_path):
     script = tmp_path / "wrong.toml"
     script.write_text("[[step]]\nread = 'identification'\nexpect = { interface_version = 99 }\n")

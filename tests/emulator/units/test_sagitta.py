@@ -198,7 +198,7 @@ def test_stars_are_reported_interleaved():
 
 
 @pytest.mark.parametrize(
-    ("row", "size"), [(11, 64), (27, 12), (28, 144), (36, 38), (37, 146), (39, 4), (40, 321), (49, 64)]
+    ("row", "size"), [(11, 64), (27, 12), (28, 144), (36, 38), (37, 146), (39, 4), (40, 321), (49, 65)]
 )
 def test_telemetry_has_the_length_of_the_table(row, size):
     def scenario(unit: Emulated) -> None:

@@ -44,7 +44,12 @@ def shape(
         "answers": answers,
         "only_sent": False,
     }
-    sizes = {"request_size": request_size, "reply_size": reply_size, "size": max(request_size, reply_size)}
+    sizes = {
+        "request_size": request_size,
+        "reply_size": reply_size,
+        "size": max(request_size, reply_size),
+        "min_size": max(request_size, reply_size),
+    }
     return cast("Row", SimpleNamespace(**keys, **sizes))
 
 

@@ -280,3 +280,46 @@ HEADER = [{"role": "id", "type": "u8"}]
 def test_parts_that_do_not_fit_one_another_are_rejected(link: dict[str, Any], message: str) -> None:
     with pytest.raises((IcdError, ProtocolError), match=message):
         stack_of(link)
+
+
+# --- requests without an answer, and to other addresses ---
+
+POLLED: dict[str, Any] = {
+    "framing": {"kind": "slip"},
+    "check": {"kind": "sum"},
+    "request_header": [
+        {"role": "address", "type": "u8", "default": 7},
+        {"type": "bits8", "bits": [{"role": "id", "width": 7}, {"role": "poll", "default": 1}]},
+    ],
+}
+
+
+def test_a_request_says_whether_it_is_answered() -> None:
+    stack = stack_of(POLLED)
+    for polled, control in ((True, 0x85), (False, 0x05)):
+        sent = stack.encode_request(Request(TC, 5, polled=polled))
+        assert sent[2] == control
+        assert [item.polled for item in stack.device().feed(sent, 0.0) if isinstance(item, Request)] == [
+            polled
+        ]
+
+
+@pytest.mark.parametrize("bits", [[{"role": "poll"}], [{"role": "poll", "default": 0}]])
+def test_a_poll_bit_that_no_request_would_set_is_rejected(bits: list[dict[str, Any]]) -> None:
+    fields = [{"type": "bits8", "bits": [{"role": "id", "width": 7}, *bits]}]
+    with pytest.raises(IcdError, match="role poll needs `default = 1`"):
+        stack_of({**POLLED, "request_header": fields})
+
+
+@pytest.mark.parametrize(
+    ("line", "kind"),
+    [
+        ("C0 07 C0", FaultKind.UART_SHORT),
+        ("C0 07 85 00 C0", FaultKind.UART_CHECK),
+        ("C0 08 C0", FaultKind.UART_ADDRESS),
+        ("C0 08 85 00 C0", FaultKind.UART_ADDRESS),
+    ],
+)
+def test_a_damaged_message_to_another_address_is_no_damage_here(line: str, kind: FaultKind) -> None:
+    found = stack_of(POLLED).device().feed(bytes.fromhex(line), 0.0)
+    assert [item.kind for item in found if isinstance(item, LinkFault)] == [kind]

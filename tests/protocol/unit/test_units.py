@@ -184,6 +184,8 @@ INVALID = [
     ("readback of telemetry", telemetry("", more="readback = 1"), "row: only telecommands have a readback"),
     ("no provenance", telemetry("").replace('provenance = "ours"', ""), "row: needs `provenance`, here or in \\[unit\\]"),
     ("no plugin", 'plugin = "unit.py"\n', "no such plugin"),
+    ("short data without a plugin", telecommand('"u16 a"', more="min_size = 1"), "command: `min_size` needs a telecommand with an action of the unit's plugin"),
+    ("short data of telemetry", telemetry('"u16 a"', more="min_size = 1"), "row: `min_size` needs a telecommand"),
 ]  # fmt: skip
 
 
@@ -321,8 +323,9 @@ def test_the_skeleton_can_be_emulated(tmp_path):
 @pytest.mark.parametrize("name", [name for name in bundled_units() if name != "cubestar"])
 def test_every_row_of_a_foreign_unit_names_its_public_source(name):
     rows = list(load_unit(name).rows)
-    assert {row.provenance for row in rows} <= {"confirmed", "ours"}
+    assert {row.provenance for row in rows} <= {"confirmed", "copy", "ours"}
     assert all(row.source for row in rows if row.provenance == "confirmed")
+    assert all(row.source.startswith("doclecture.net/1-359") for row in rows if row.provenance == "copy")
     assert not any(row.source for row in rows if row.provenance == "ours")
 
 
