@@ -270,16 +270,19 @@ _SHOTS: Final[dict[str, Callable[[EcssDevice, Condition, int, np.random.Generato
 
 
 def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
-    """Solve the frames of a part; return outcomes, errors and stated uncertainties (arcseconds), and numbers of field and condition."""
+    """Solve the frames of a part; return outcomes, errors and stated uncertainties (arcseconds),
+    numbers of field and condition, and attitude matrices."""
     device = of_thread(EcssDevice, plan)
     numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, condition.frames))
     errors = np.full((len(numbers), 3), np.nan)
     stated = np.full((len(numbers), 2), np.nan)
     outcome = np.zeros(len(numbers), dtype="U24")
     labels = np.zeros((len(numbers), 3), dtype=np.int64)
+    to_sensor = np.zeros((len(numbers), 3, 3))
     for row, number in enumerate(numbers):
         shot, result = device.solve(condition, number)
         labels[row] = shot.field_number, shot.condition_number, result.detected
+        to_sensor[row] = shot.attitude.matrix
         outcome[row] = result.reason
         if not result.valid:
             continue
@@ -292,7 +295,13 @@ def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
             outcome[row] = "rate_too_high"
         else:
             outcome[row] = "wrong" if too_far else "correct"
-    return {"outcome": outcome, "error_arcsec": errors, "stated_arcsec": stated, "labels": labels}
+    return {
+        "outcome": outcome,
+        "error_arcsec": errors,
+        "stated_arcsec": stated,
+        "labels": labels,
+        "to_sensor": to_sensor,
+    }
 
 
 def run_ecss(
