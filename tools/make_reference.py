@@ -35,7 +35,6 @@ MODEL_FILE: Final = ROOT / "configs" / "units" / "model.toml"
 UNITS: Final = {
     "baud": "Bd",
     "cosmic_rays_s": "1/s",
-    "electrons_s": "electrons/s/px",
     "epoch": "Julian year",
     "false_star_magnitudes": "V",
     "height": "px",

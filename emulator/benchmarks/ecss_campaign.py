@@ -270,8 +270,10 @@ _SHOTS: Final[dict[str, Callable[[EcssDevice, Condition, int, np.random.Generato
 
 
 def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
-    """Solve the frames of a part; return outcomes, errors and stated uncertainties (arcseconds),
-    numbers of field and condition, and attitude matrices."""
+    """Solve the frames of a part; return their outcomes.
+
+    With them come errors and stated uncertainties, arcseconds, numbers of field and condition, and attitude matrices.
+    """
     device = of_thread(EcssDevice, plan)
     numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, condition.frames))
     errors = np.full((len(numbers), 3), np.nan)
