@@ -33,12 +33,14 @@ DOCS: Final = ROOT / "docs"
 MODEL_FILE: Final = ROOT / "configs" / "units" / "model.toml"
 
 UNITS: Final = {
+    "anomaly_s": "1/s",
     "baud": "Bd",
     "cosmic_rays_s": "1/s",
     "epoch": "Julian year",
     "false_star_magnitudes": "V",
     "height": "px",
     "magnitude": "V",
+    "quiet_s": "1/s",
     "rate_window": "frames",
     "split": "bytes",
     "start_unix_s": "Unix time, s",

@@ -173,11 +173,11 @@ class ThermalConfig(Strict):
 class RadiationConfig(Strict):
     """Energetic particles that hit the detector, in addition to `sky.cosmic_rays_s`."""
 
-    quiet_s: ParticleRate = 0.0
-    """Particles per second outside the South Atlantic Anomaly."""
-    anomaly_s: ParticleRate = 0.0
-    """Additional particles per second in the centre of the anomaly at an altitude of 500 km; needs a truth
-    with a position."""
+    quiet_s: ParticleRate | None = None
+    """Particles per second outside the South Atlantic Anomaly. Default: with an orbit 2 on each cm² of the detector, else 0."""
+    anomaly_s: ParticleRate | None = None
+    """Additional particles per second in the centre of the anomaly at an altitude of 500 km, with an orbit. Default:
+    500 on each cm² of the detector."""
 
 
 class ImagesConfig(Strict):

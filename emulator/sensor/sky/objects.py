@@ -183,7 +183,7 @@ class SkyObjects:
     missing_stars: int = limited(0, _MAX_OBJECTS, 0)
     """Number of catalogue stars omitted, the brightest in the field."""
     cosmic_rays_s: float = limited(0.0, 1e6, 0.0)
-    """Mean number of particles per second that hit the detector, each leaving a streak."""
+    """Mean number of particles per second that hit the detector, each leaving thousands of electrons in few pixels."""
     blank: bool = False
     """True if no light reaches the detector."""
 

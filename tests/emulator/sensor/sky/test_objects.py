@@ -201,13 +201,13 @@ def test_planets_are_points_at_their_directions(renderer: Renderer) -> None:
     assert np.linalg.norm(found.xy_px - place(83.0, 3.0), axis=1).min() < 0.1
 
 
-def test_particles_leave_streaks_at_their_true_positions(renderer: Renderer) -> None:
+def test_particles_leave_charge_at_their_true_positions(renderer: Renderer) -> None:
     frame = renderer.render(ORION, objects=SkyObjects(cosmic_rays_s=200.0))
     plain = renderer.render(ORION)
     assert frame.objects is not None
-    streaks = frame.objects.cosmic_rays_px
-    assert 15 <= len(streaks) <= 70
-    middles = 0.5 * (streaks[:, :2] + streaks[:, 2:])
+    tracks = frame.objects.cosmic_rays_px
+    assert 15 <= len(tracks) <= 70
+    middles = 0.5 * (tracks[:, :2] + tracks[:, 2:])
     middles = middles[np.all((middles > 5.0) & (middles < 930.0), axis=1)]
     brighter = [mean_around(frame.image, xy, 0) > mean_around(plain.image, xy, 0) + 50.0 for xy in middles]
     assert np.mean(brighter) > 0.9
