@@ -180,7 +180,8 @@ def test_sensor_gives_the_modelled_latency_and_the_highest_rates():
             (timing.identify_lost_s, "lost in space"),
             (timing.identify_tracking_s, "tracking"),
         ):
-            latency_s = half_exposure_s + timing.readout_s + timing.detect_s + identify_s
+            from_s = 1.0 - half_exposure_s if timing.overlapped else half_exposure_s + timing.readout_s
+            latency_s = from_s + timing.detect_s + identify_s
             assert re.search(rf"{1000 * latency_s:.0f} ms [a-z ]*{name}", text)
     pairs = re.findall(r"^\| (\d+) ms \| (\d+) Hz \|$", text, re.MULTILINE)
     assert len(pairs) == 4

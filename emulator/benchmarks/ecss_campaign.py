@@ -149,7 +149,7 @@ class EcssDevice:
         self.gain = float(parameters["analog_gain"])
         self.max_rate_deg_s = float(parameters["max_rate"])
         timing, thermal = profile.timing, profile.thermal
-        busy_s = self.exposure_s + timing.readout_s + timing.detect_s + timing.identify_tracking_s
+        busy_s = timing.busy_s(self.exposure_s, tracking=True)
         period_s = max(1.0 / float(parameters["update_rate"]), exposure_period_s(parameters))
         cycle = FrameTiming(True, 0, busy_s, period_s)  # noqa: FBT003 (running)
         self.power_w = PowerModel(profile.power).mean_power_w(cycle)

@@ -226,6 +226,18 @@ class TimingConfig(Strict):
     """Identification, lost in space."""
     identify_tracking_s: FrameSeconds = 0.010
     """Identification, tracking."""
+    overlapped: bool = False
+    """Whether an image is processed while the next one is exposed: its result comes a period later. Otherwise, it is
+    processed right after its own exposure."""
+
+    def processing_s(self, *, tracking: bool) -> float:
+        """Return the time of detection and identification of a frame without stars, seconds."""
+        return self.detect_s + (self.identify_tracking_s if tracking else self.identify_lost_s)
+
+    def busy_s(self, exposure_s: float, *, tracking: bool) -> float:
+        """Return how long a period's exposure, read-out and processing take: at the same time if they overlap, seconds."""
+        capture_s, processing_s = exposure_s + self.readout_s, self.processing_s(tracking=tracking)
+        return max(capture_s, processing_s) if self.overlapped else capture_s + processing_s
 
 
 class SerialConfig(Strict):
