@@ -34,13 +34,14 @@ ROOT: Final = Path(__file__).resolve().parent.parent
 DOCS: Final = ROOT / "docs"
 
 UNITS: Final = {
+    "anomaly_s": "1/s",
     "baud": "Bd",
     "cosmic_rays_s": "1/s",
-    "electrons_s": "electrons/s/px",
     "epoch": "Julian year",
     "false_star_magnitudes": "V",
     "height": "px",
     "magnitude": "V",
+    "quiet_s": "1/s",
     "rate_window": "frames",
     "split": "bytes",
     "start_unix_s": "Unix time, s",

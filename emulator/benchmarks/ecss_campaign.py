@@ -154,7 +154,7 @@ class EcssDevice:
         self.gain = float(parameters["analog_gain"])
         self.max_rate_deg_s = float(parameters["max_rate"])
         timing, thermal = profile.timing, profile.thermal
-        busy_s = self.exposure_s + timing.readout_s + timing.detect_s + timing.identify_tracking_s
+        busy_s = timing.busy_s(self.exposure_s, tracking=True)
         period_s = max(1.0 / float(parameters["update_rate"]), exposure_period_s(parameters))
         cycle = FrameTiming(True, 0, busy_s, period_s)  # noqa: FBT003 (running)
         self.power_w = PowerModel(profile.power).mean_power_w(cycle)
@@ -275,16 +275,21 @@ _SHOTS: Final[dict[str, Callable[[EcssDevice, Condition, int, np.random.Generato
 
 
 def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
-    """Solve the frames of a part; return outcomes, errors and stated uncertainties (arcseconds), and numbers of field and condition."""
+    """Solve the frames of a part; return their outcomes.
+
+    With them come errors and stated uncertainties, arcseconds, numbers of field and condition, and attitude matrices.
+    """
     device = of_thread(EcssDevice, plan)
     numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, condition.frames))
     errors = np.full((len(numbers), 3), np.nan)
     stated = np.full((len(numbers), 2), np.nan)
     outcome = np.zeros(len(numbers), dtype="U24")
     labels = np.zeros((len(numbers), 3), dtype=np.int64)
+    to_sensor = np.zeros((len(numbers), 3, 3))
     for row, number in enumerate(numbers):
         shot, result = device.solve(condition, number)
         labels[row] = shot.field_number, shot.condition_number, result.detected
+        to_sensor[row] = shot.attitude.matrix
         outcome[row] = result.reason
         if not result.valid:
             continue
@@ -297,7 +302,13 @@ def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
             outcome[row] = "rate_too_high"
         else:
             outcome[row] = "wrong" if too_far else "correct"
-    return {"outcome": outcome, "error_arcsec": errors, "stated_arcsec": stated, "labels": labels}
+    return {
+        "outcome": outcome,
+        "error_arcsec": errors,
+        "stated_arcsec": stated,
+        "labels": labels,
+        "to_sensor": to_sensor,
+    }
 
 
 def run_ecss(

@@ -45,6 +45,8 @@ class ErrorSeries:
     """Number of the direction of the sky, (n,)."""
     condition: Labels
     """Number of the condition within each field: the sub-pixel position, the temperature or the date, (n,)."""
+    to_sensor: Array
+    """Attitude matrices ICRS→sensor, (n, 3, 3)."""
 
 
 @dataclass(frozen=True)
@@ -183,9 +185,12 @@ def static_errors(
 def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confidence: float) -> ErrorLine:
     """Return the error that differs between dates: the aberration that the device does not correct.
 
-    The conditions of the first series are dates. Aberration also moves the stars across pixels, so the pixel
-    spatial error in the second series (see `static_errors`) is subtracted from the variance. If a series
-    is None, the line is not evaluated.
+    The conditions of the first series are dates. Across the boresight, the size is the quantile over fields and dates of
+    the turn that a velocity common to all fields explains, one velocity for each date, relative to the mean of the field:
+    over a year it is a sinusoid, bounded, which a multiple of its standard deviation would exceed. What differs between
+    fields for other reasons, such as stars that cross pixels, is left out. About the boresight, aberration turns a field
+    only as far as its stars are unevenly distributed; that is a multiple of the standard deviation, without the
+    pixel spatial error in the second series (see `static_errors`). If a series is None, the line is not evaluated.
     """
     if dated is None:
         return ErrorLine(ABERRATION, None, np.zeros(3))
@@ -193,7 +198,51 @@ def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confiden
     at_rest = _Nested.of(static)
     pixel = np.maximum(at_rest.condition_ms - at_rest.noise_ms, 0.0) / at_rest.k1
     variance, least = _Nested.of(dated).condition_variance(pixel, at_rest.cells - at_rest.fields)
-    return ErrorLine(ABERRATION, factor * np.sqrt(variance), factor * np.sqrt(least))
+    size, smallest = _common_velocity(dated, confidence)
+    return ErrorLine(
+        ABERRATION,
+        np.append(size, factor * np.sqrt(variance[2])),
+        np.append(smallest, factor * np.sqrt(least[2])),
+    )
+
+
+def _common_velocity(series: ErrorSeries, confidence: float) -> tuple[Vectors, Vectors]:
+    """Return the turn about x and y due to one velocity for each condition, 0 if not significant, and the smallest significant (2,).
+
+    A velocity v, in units of c and the sensor frame, turns a sensor that does not correct it by (−v_y, v_x).
+    """
+    from scipy.stats import f as f_distribution
+
+    cells, first, of_cell, frames = np.unique(
+        np.column_stack([series.field, series.condition]),
+        axis=0, return_index=True, return_inverse=True, return_counts=True,
+    )  # fmt: skip
+    mean_error = _means(series.error_arcsec, of_cell.reshape(-1), frames)[:, :2]
+    _, field, sizes = np.unique(cells[:, 0], return_inverse=True, return_counts=True)
+    dates, date = np.unique(cells[:, 1], return_inverse=True)
+    to_sensor = series.to_sensor[first]
+    design = np.zeros((len(cells), 2, len(dates), 3))
+    design[np.arange(len(cells)), :, date] = np.stack([-to_sensor[:, 1], to_sensor[:, 0]], axis=1)
+
+    def within_fields(values: Vectors) -> Vectors:
+        sums = np.zeros((len(sizes), *values.shape[1:]))
+        np.add.at(sums, field, values)
+        return np.asarray(values - (sums / sizes.reshape(-1, *[1] * (values.ndim - 1)))[field])
+
+    error = within_fields(mean_error)
+    matrix = within_fields(design).reshape(error.size, -1)
+    velocity, _, rank, _ = np.linalg.lstsq(matrix, error.ravel(), rcond=1e-9)
+    explained = (matrix @ velocity).reshape(error.shape)
+    left = error.size - 2 * len(sizes) - rank
+    if rank == 0 or left <= 0:
+        raise EmulatorError(
+            f"{ABERRATION}: {len(sizes)} fields on {len(dates)} dates: more of each are needed"
+        )
+    rest_ms = float(np.sum((error - explained) ** 2)) / left
+    limit = rest_ms * float(f_distribution.isf(SIGNIFICANCE, rank, left))
+    significant = float(np.sum(explained**2)) > rank * limit
+    size = np.quantile(np.abs(explained), confidence, axis=0, method="higher")
+    return np.where(significant, size, 0.0), np.full(2, math.sqrt(2.0 * rank * limit / error.size))
 
 
 def thermo_elastic_error(series: ErrorSeries, confidence: float) -> ErrorLine:

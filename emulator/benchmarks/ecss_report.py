@@ -191,7 +191,7 @@ def _series(results: Results) -> ErrorSeries:
     """Return the errors of the frames with a correct attitude."""
     good = results["outcome"] == "correct"
     labels = results["labels"][good]
-    return ErrorSeries(results["error_arcsec"][good], labels[:, 0], labels[:, 1])
+    return ErrorSeries(results["error_arcsec"][good], labels[:, 0], labels[:, 1], results["to_sensor"][good])
 
 
 def _outcomes(influence: str, value: float, results: Results) -> Outcomes:

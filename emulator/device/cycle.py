@@ -1,7 +1,8 @@
 """The exposure cycle: start of exposures, requests to the pipeline, and publication of results.
 
 Exposures start on a grid of the update period. Read-out, detection and identification take the times in the
-profile's `[timing]`, so that on the stepped clock the same run gives the same bytes. On other clocks, a result that
+profile's `[timing]`, so that on the stepped clock the same run gives the same bytes. Processing starts after the exposure, or with
+the next one (`timing.overlapped`). On other clocks, a result that
 the machine delivers later is published when it arrives, and flagged as late. If the machine falls behind by
 `MAX_PENDING` requests or, at high rates, by the modelled time of the steps, exposures are skipped: the last
 attitude stays valid until it is too old, and tracking continues from it.
@@ -128,7 +129,7 @@ class FrameCycle:
         return FrameTiming(
             self.running,
             self._grid_ns + int(self._parameters["delay_time"]) * 1_000_000,
-            self.exposure_s + self._processing_ns(tracking=tracking) / NANOSECONDS,
+            self._timing.busy_s(self.exposure_s, tracking=tracking),
             self._period_ns() / NANOSECONDS,
         )
 
@@ -196,11 +197,11 @@ class FrameCycle:
     def _identify_s(self, *, tracking: bool) -> float:
         return self._timing.identify_tracking_s if tracking else self._timing.identify_lost_s
 
-    def _processing_ns(self, *, tracking: bool) -> int:
-        """Return the modelled time from the end of an exposure to a result without stars."""
+    def _ready_ns(self, start_ns: int, exposure_s: float, period_s: float, *, tracking: bool) -> int:
+        """Return the modelled time of a result without stars, from the start of the exposure."""
         timing = self._timing
-        seconds = timing.readout_s + timing.detect_s + self._identify_s(tracking=tracking)
-        return round(seconds * NANOSECONDS)
+        processed_from_s = period_s if timing.overlapped else exposure_s + timing.readout_s
+        return start_ns + round((processed_from_s + timing.processing_s(tracking=tracking)) * NANOSECONDS)
 
     def _start_exposure(self, due_ns: int) -> None:
         """Start an exposure and schedule the next one on the grid."""
@@ -210,7 +211,8 @@ class FrameCycle:
         missed = max(0, (now_ns - due_ns) // period_ns)
         self.skipped += missed
         self._next = self._scheduler.at(due_ns + (missed + 1) * period_ns, self._start_exposure)
-        if self._imager.pending >= max(MAX_PENDING, self._processing_ns(tracking=True) / period_ns):
+        processing_s = self._timing.readout_s + self._timing.processing_s(tracking=True)
+        if self._imager.pending >= max(MAX_PENDING, processing_s * NANOSECONDS / period_ns):
             self.skipped += 1
             return
         exposure_s = self.exposure_s
@@ -218,10 +220,10 @@ class FrameCycle:
         end_ns = start_ns + round(exposure_s * NANOSECONDS)
         mid_ns = start_ns + round(exposure_s * NANOSECONDS / 2)
         begun = (start_ns, mid_ns, self._modes.mode, exposure_s, period_ns / NANOSECONDS)
-        self._scheduler.at(end_ns, self._until_stopped(lambda close_ns: self._end_exposure(close_ns, *begun)))
+        self._scheduler.at(end_ns, self._until_stopped(lambda _: self._end_exposure(*begun)))
 
     def _end_exposure(
-        self, end_ns: int, start_ns: int, mid_ns: int, mode: Mode, exposure_s: float, period_s: float
+        self, start_ns: int, mid_ns: int, mode: Mode, exposure_s: float, period_s: float
     ) -> None:
         """End an exposure and request its result from the pipeline."""
         truth = self._surroundings.state(mid_ns)
@@ -229,7 +231,7 @@ class FrameCycle:
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
         request = self._request(truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
         self._in_flight.append(frame)
-        ready_ns = end_ns + self._processing_ns(tracking=frame.tracking)
+        ready_ns = self._ready_ns(start_ns, exposure_s, period_s, tracking=frame.tracking)
         self._imager.submit(request, self._until_stopped(partial(self._result_arrived, frame)))
         self._scheduler.at(ready_ns, self._until_stopped(partial(self._schedule_publication, frame)))
         self._signals.exposed.emit(frame.index)

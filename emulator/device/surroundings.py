@@ -10,7 +10,7 @@ from typing import Any
 from starhil.emulator.device.power import ThermalModel
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
-from starhil.emulator.sensor.sky.radiation import particle_rate
+from starhil.emulator.sensor.sky.radiation import default_rates, particle_rate
 from starhil.emulator.sensor.sky.view import has_aberration
 from starhil.emulator.truth.orbit import Orbit
 from starhil.emulator.truth.source import TruthSource, TruthState
@@ -37,7 +37,13 @@ class Surroundings:
         self.has_aberration = profile.images.used or bool(has_aberration(profile.sky))
         self.faults: dict[str, Any] = {}
         """Optical faults: fields of the sky objects that differ from the profile's."""
+        from starhil.emulator.sensor.model import SensorModel
+
         self._radiation = profile.radiation
+        camera = profile.camera
+        self._default_rates = default_rates(
+            camera.width, camera.height, float(profile.sensor.get("pixel_um", SensorModel.pixel_um))
+        )
         self._start_unix_s = profile.start_unix_s
         self._orbit = orbit_of(profile)
         self._lacks_orbit = False
@@ -61,8 +67,9 @@ class Surroundings:
     def conditions(self, truth: TruthState) -> Conditions:
         """Return the current conditions of the detector."""
         position_m = None if truth.orbit is None else truth.orbit.position_m
+        radiation = self._radiation
         particles_s = particle_rate(
-            self._radiation.quiet_s, self._radiation.anomaly_s, position_m, truth.unix_s
+            radiation.quiet_s, radiation.anomaly_s, position_m, truth.unix_s, self._default_rates
         )
         return Conditions(self._thermal.state.temperature_c(self._now_ns()), particles_s)
 

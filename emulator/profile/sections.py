@@ -174,11 +174,11 @@ class ThermalConfig(Strict):
 class RadiationConfig(Strict):
     """Energetic particles that hit the detector, in addition to `sky.cosmic_rays_s`."""
 
-    quiet_s: ParticleRate = 0.0
-    """Particles per second outside the South Atlantic Anomaly."""
-    anomaly_s: ParticleRate = 0.0
-    """Additional particles per second in the centre of the anomaly at an altitude of 500 km; needs a truth
-    with a position."""
+    quiet_s: ParticleRate | None = None
+    """Particles per second outside the South Atlantic Anomaly. Default: with an orbit 2 on each cm² of the detector, else 0."""
+    anomaly_s: ParticleRate | None = None
+    """Additional particles per second in the centre of the anomaly at an altitude of 500 km, with an orbit. Default:
+    500 on each cm² of the detector."""
 
 
 class ImagesConfig(Strict):
@@ -227,6 +227,18 @@ class TimingConfig(Strict):
     """Identification, lost in space."""
     identify_tracking_s: FrameSeconds = 0.010
     """Identification, tracking."""
+    overlapped: bool = False
+    """Whether an image is processed while the next one is exposed: its result comes a period later. Otherwise, it is
+    processed right after its own exposure."""
+
+    def processing_s(self, *, tracking: bool) -> float:
+        """Return the time of detection and identification of a frame without stars, seconds."""
+        return self.detect_s + (self.identify_tracking_s if tracking else self.identify_lost_s)
+
+    def busy_s(self, exposure_s: float, *, tracking: bool) -> float:
+        """Return how long a period's exposure, read-out and processing take: at the same time if they overlap, seconds."""
+        capture_s, processing_s = exposure_s + self.readout_s, self.processing_s(tracking=tracking)
+        return max(capture_s, processing_s) if self.overlapped else capture_s + processing_s
 
 
 class SerialConfig(Strict):

@@ -39,7 +39,7 @@ def measure_dark_map(sensor: SensorModel, height: int, width: int, frames: int, 
 
     The exposure, at most 1 s, is chosen so that the mean dark signal fills half of the converter's range.
     """
-    unit = sensor.with_(gain=1.0, temperature_c=sensor.reference_c)
+    unit = sensor.with_(gain=1.0, temperature_c=sensor.reference_c, damage_tev_g=0.0)  # on the ground
     exposure_s = min(_LONGEST_S, _HEADROOM * unit.adc_range_e / max(unit.dark_e_s, 1.0))
     mean_e = make_fixed_pattern(unit, height, width).dark_e_s * np.float32(exposure_s)
     total = np.zeros((height, width), dtype=np.float32)

@@ -7,11 +7,57 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from starhil.emulator.sensor.model import SensorModel
 from starid.arrays import Array32, Indices
 
 _HOT_LOG_SPREAD: Final = 1.0
+
+_DAMAGE_E_S: Final = 4400.0
+_DAMAGE_UM3_TEV_G: Final = 31_150.0
+"""Mean dark current of a displacement cascade in silicon at 22 °C, electrons/s, exponentially distributed, and volume times
+dose in which there is one (Belloir et al. 2016, Optics Express 24, 4299)."""
+
+_TELEGRAPH_E_S: Final = 1200.0
+_TELEGRAPH_PER_UM3_TEV_G: Final = 3.5e-5
+"""Mean amplitude of the random telegraph signals of dark current at 22 °C, electrons/s, exponentially distributed, and their
+number (Virmontois et al. 2011, IEEE TNS 58, 3085: 35 per cm³ and MeV/g)."""
+
+_LONGEST_DWELL: Final = 1000.0
+"""Mean number of frames for which the slowest signals stay; the fastest change with every frame."""
+
+
+@dataclass(frozen=True)
+class TelegraphSignals:
+    """Dark currents that switch at random between zero and their amplitude."""
+
+    pixel: Indices
+    """Number of the pixel, row by row, (n,); a pixel may have several."""
+    dark_e_s: Array32
+    """Amplitude, electrons/s, (n,), float32."""
+    dwell: Indices
+    """Number of frames for which a state lasts, (n,)."""
+    seed: int
+
+    def add(self, mean_e: Array32, frame: int, factor: float) -> None:
+        """Add the electrons of a frame to the means (h, w), in place; `factor` is the exposure, scaled by temperature."""
+        if not self.pixel.size:
+            return
+        number = np.arange(self.pixel.size, dtype=np.uint64)
+        period = ((frame + self.pixel) // self.dwell).astype(np.uint64)
+        high = _scrambled(period + _scrambled(number + np.uint64(self.seed))) >> np.uint64(63)
+        np.add.at(
+            mean_e.reshape(-1), self.pixel, self.dark_e_s * high.astype(np.float32) * np.float32(factor)
+        )
+
+
+def _scrambled(number: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """Return well mixed bits of numbers (n,): the finalizer of SplitMix64."""
+    mixed = number + np.uint64(0x9E3779B97F4A7C15)
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return mixed ^ (mixed >> np.uint64(31))
 
 
 @dataclass(frozen=True)
@@ -22,6 +68,7 @@ class FixedPattern:
     """Signal relative to the mean pixel, (h, w), float32; 0 for a dead pixel."""
     dark_e_s: Array32
     """Dark current, electrons/s, (h, w), float32."""
+    telegraph: TelegraphSignals
     hot: Indices
     dead: Indices
     """Rows and columns of the hot and of the dead pixels, (n, 2), int."""
@@ -31,19 +78,32 @@ def make_fixed_pattern(sensor: SensorModel, height: int, width: int) -> FixedPat
     """Draw the fixed pattern of a pixel array from the sensor's `pattern_seed`.
 
     Dark currents are gamma-distributed (never negative, with the long upper tail of silicon), sensitivities
-    are normal, hot pixels log-normal. No pixel is both hot and dead. The last two patterns are cached,
-    because exposure and gain do not affect them.
+    are normal, hot pixels log-normal. No pixel is both hot and dead. Radiation damage adds dark current and random
+    telegraph signals, and leaves the rest of the pattern as it is. The last two patterns are cached, because exposure and
+    gain do not affect them.
     """
     pixels = (sensor.hot_pixels, sensor.dead_pixels)
     spreads = (sensor.prnu, sensor.dsnu, sensor.dark_e_s, sensor.hot_e_s)
-    return _draw(sensor.pattern_seed, height, width, pixels, spreads)
+    return _draw(
+        sensor.pattern_seed,
+        height,
+        width,
+        pixels,
+        spreads,
+        sensor.pixel_um**2 * sensor.epi_um * sensor.damage_tev_g,
+    )
 
 
 @lru_cache(maxsize=2)
 def _draw(
-    seed: int, height: int, width: int, pixels: tuple[int, int], spreads: tuple[float, float, float, float]
+    seed: int,
+    height: int,
+    width: int,
+    pixels: tuple[int, int],
+    spreads: tuple[float, float, float, float],
+    damage: float,
 ) -> FixedPattern:
-    """Draw a read-only pattern from numbers of (hot, dead) pixels and (prnu, dsnu, dark_e_s, hot_e_s)."""
+    """Draw a read-only pattern from numbers of (hot, dead) pixels, (prnu, dsnu, dark_e_s, hot_e_s) and damage, µm³·TeV/g."""
     hot_pixels, dead_pixels = pixels
     prnu, dsnu, dark_e_s, hot_e_s = spreads
     rng = np.random.default_rng((seed, height, width))
@@ -59,6 +119,17 @@ def _draw(
         shape = 1.0 / dsnu**2
         dark = rng.standard_gamma(shape, size, dtype=np.float32) * np.float32(dark_e_s / shape)
     dark[hot] += (hot_e_s * np.exp(_HOT_LOG_SPREAD * rng.standard_normal(hot.size))).astype(np.float32)
+    rng = np.random.default_rng((seed, height, width, 1))
+    if damage > 0.0:
+        cascades = rng.poisson(damage / _DAMAGE_UM3_TEV_G, size)
+        dark += (_DAMAGE_E_S * rng.standard_gamma(cascades)).astype(np.float32)
+    switching = np.sort(rng.integers(0, size, rng.poisson(size * damage * _TELEGRAPH_PER_UM3_TEV_G)))
+    telegraph = TelegraphSignals(
+        switching,
+        rng.exponential(_TELEGRAPH_E_S, switching.size).astype(np.float32),
+        np.rint(_LONGEST_DWELL ** rng.random(switching.size)).astype(np.int64),
+        seed,
+    )
     sensitivity[dead] = 0.0
     dark[dead] = 0.0
     for pattern in (sensitivity, dark):
@@ -66,6 +137,7 @@ def _draw(
     return FixedPattern(
         sensitivity.reshape(height, width),
         dark.reshape(height, width),
+        telegraph,
         np.column_stack(np.divmod(np.sort(hot), width)),
         np.column_stack(np.divmod(np.sort(dead), width)),
     )

@@ -89,6 +89,13 @@ class SensorModel:
     """Relative change of the focal length, 1/°C."""
     k1_drift: float = _limited(0.0, -1e-2, 1e-2, "1/°C")
     """Change of the distortion k1, 1/°C."""
+    pixel_um: float = _limited(12.0, 0.5, 100.0, "micrometres")
+    """Width of a pixel, micrometres; it decides only what particles do."""
+    epi_um: float = _limited(10.0, 0.1, 1000.0, "micrometres")
+    """Thickness of the epitaxial layer, in which particles leave charge, micrometres."""
+    damage_tev_g: float = _limited(0.0, 0.0, 1e4, "TeV/g")
+    """Displacement damage dose of the detector since it was on the ground, TeV/g; 1e10 protons/cm² of 50 MeV give 39. It
+    makes hot pixels, and pixels whose dark current switches between two values."""
     sky_mag_arcsec2: float = _limited(22.1, -10.0, 40.0, "magnitudes/arcsec²")
     """Brightness of the sky background (zodiacal light and unresolved stars), V magnitudes/arcsec²."""
     dsnu: float = _limited(0.2, 0.0, 2.0, "a share of the dark current")

@@ -14,7 +14,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
 from starhil.emulator.sensor.model import SOLAR_COLOUR_B_V, SensorModel
 from starhil.emulator.sensor.noise import digitize
-from starhil.emulator.sensor.particle_hits import add_cosmic_rays
+from starhil.emulator.sensor.particle_hits import add_protons
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.rolling_shutter import at_row_times
 from starhil.emulator.sensor.sky.ephemeris import Observer
@@ -74,7 +74,7 @@ class ObjectTruth:
     planet_xy_px: Array
     """Positions of the planets in the order of `SkyObjects.planets`, (m, 2); NaN outside the image."""
     cosmic_rays_px: Array
-    """x, y of both ends of each streak, (k, 4)."""
+    """x, y of both ends of each track, (k, 4)."""
     covered_share: float
     """Fraction of the image that receives less than half of the sky's light."""
 
@@ -195,6 +195,7 @@ class Renderer:
         if others is not None and others.has_extended_objects:
             area = self._painter.paint(others, optical_axis)
         mean = self._mean_without_stars(exposure, temperature, area)
+        self._pattern.telegraph.add(mean, index, exposure * sensor.dark_factor(temperature))
         planets = () if others is None else others.planets
         path, chosen, inside = self._paths(optical_axis, rate, exposure, observer, planets)
         count = int(np.count_nonzero(chosen < len(self._rows)))
@@ -213,8 +214,9 @@ class Renderer:
             planet_xy[chosen[shown] - len(self._rows)] = path[shown, :2]
             rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
             false_xy = self._add_false_stars(mean, others, rng, exposure)
-            streaks = add_cosmic_rays(mean, int(rng.poisson(others.cosmic_rays_s * exposure)), rng)
-            object_truth = ObjectTruth(false_xy, planet_xy, streaks, area.covered_share if area else 0.0)
+            particles = int(rng.poisson(others.cosmic_rays_s * exposure))
+            tracks = add_protons(mean, particles, rng, sensor.epi_um, sensor.pixel_um)
+            object_truth = ObjectTruth(false_xy, planet_xy, tracks, area.covered_share if area else 0.0)
         self._add_light(mean, path, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
         rows = self._rows[chosen[centred]]

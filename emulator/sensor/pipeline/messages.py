@@ -195,7 +195,7 @@ class MatchedStar:
     snr: float
     """Signal-to-noise ratio."""
     vector: Triple
-    """Measured direction in the sensor frame, by the camera of the profile."""
+    """Measured direction in the sensor frame, by the calibrated camera of the quaternion."""
     icrs: Triple
     """Modelled direction: that of the star in the catalogue, in ICRS, without aberration."""
 

@@ -194,9 +194,8 @@ class Pipeline:
         identifier, current = self._identifiers.get(self._identifier_setup(request))
         solution = self._solve(identifier, found, request)
         solved = time.perf_counter()
-        modelled = identifier.catalog.vectors[solution.catalog_index]
         times = (begin, rendered, detected, solved)
-        result = self._frame_result(request, sensor, found, solution, modelled, times)
+        result = self._frame_result(request, sensor, found, solution, identifier, times)
         if exposure.frame is not None:
             stars = exposure.frame.stars
             seen = stars_seen(stars.xy_px[stars.visible], found.xy_px) if exposure.in_field else 0
@@ -302,12 +301,15 @@ class Pipeline:
         sensor: SensorModel,
         found: Detections,
         solution: Solution,
-        modelled: Array,
+        identifier: StarIdentifier,
         times: tuple[float, float, float, float],
     ) -> FrameResult:
+        """Return the result of a frame; the vectors of its stars are by the camera of its quaternion."""
         begin, rendered, detected, solved = times
         zero_e = sensor.zero_magnitude_e_s * sensor.exposure_s
-        measured = self.camera.back_project(found.xy_px[solution.detection_index])
+        camera = _camera_of(solution, identifier)
+        measured = camera.back_project(found.xy_px[solution.detection_index])
+        modelled = identifier.catalog.vectors[solution.catalog_index]
         stars = sorted(
             (
                 MatchedStar(
@@ -366,9 +368,14 @@ def _within_margin(identifier: StarIdentifier, solution: Solution, xy: Array, re
     icrs = identifier.catalog.vectors[solution.catalog_index]
     if request.observer_velocity is not None:
         icrs = aberrated(icrs, request.observer_velocity)
-    expected_xy, _ = identifier.camera.project(solution.attitude.to_sensor(icrs))
+    expected_xy, _ = _camera_of(solution, identifier).project(solution.attitude.to_sensor(icrs))
     offset_px = np.hypot(*(expected_xy - xy[solution.detection_index]).T)
     return int(np.count_nonzero(offset_px <= request.settings.validation_margin))
+
+
+def _camera_of(solution: Solution, identifier: StarIdentifier) -> Camera:
+    """Return the camera with which an attitude was found: the calibrated one, or that one refined by the solution."""
+    return identifier.camera if solution.camera is None else solution.camera
 
 
 def detection_settings(known: DetectionSettings, settings: SolverSettings) -> DetectionSettings:

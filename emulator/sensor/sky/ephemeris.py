@@ -140,7 +140,7 @@ def sun_seen_by(observer: Observer, style: SunGlare, earth: EarthLimb | None) ->
     if share == 0.0:
         return None
     ra_deg, dec_deg = observer.places_deg[0]
-    return dataclasses.replace(style, ra_deg=ra_deg, dec_deg=dec_deg, electrons_s=share * style.electrons_s)
+    return dataclasses.replace(style, ra_deg=ra_deg, dec_deg=dec_deg, stray_share=share * style.stray_share)
 
 
 def moon_seen_by(observer: Observer, style: Moon) -> Moon:

@@ -25,6 +25,7 @@ from starhil.emulator.sensor.sky.light_kernels import (
     transmission_at,
 )
 from starhil.emulator.sensor.sky.objects import (
+    SUN_V,
     CelestialBody,
     EarthLimb,
     Moon,
@@ -295,14 +296,25 @@ class AreaPainter:
         if isinstance(body, SunGlare):
             reference = 2.0 * math.sin(math.radians(_SUN_REFERENCE_DEG) / 2.0)
             soft = 2.0 * math.sin(math.radians(_SUN_SOFT_DEG) / 2.0)
-            return body.electrons_s * reference**3, soft, True
-        share = body.glare_share / (2.0 * math.pi * math.log(_GLARE_TO_DEG / _GLARE_FROM_DEG))
-        total = self._moonlight(body)
-        return total * share * self._camera.pixel_scale_rad**2, math.radians(_GLARE_FROM_DEG), False
+            return body.stray_share * self._scattered(body.disc) * reference, soft, True
+        return self._scattered(body), math.radians(_GLARE_FROM_DEG), False
 
-    def _moonlight(self, moon: Moon) -> float:
-        """Electrons/s from the whole Moon."""
-        return self._zero_magnitude_e_s * math.pow(10.0, -0.4 * moon.magnitude)
+    def _scattered(self, body: Moon) -> float:
+        """Electrons/s per pixel that the lens scatters at an angle, times its square as chord.
+
+        The fraction `glare_share` of the light in the pupil goes into the angles between `_GLARE_FROM_DEG` and
+        `_GLARE_TO_DEG`.
+        """
+        share = body.glare_share / (2.0 * math.pi * math.log(_GLARE_TO_DEG / _GLARE_FROM_DEG))
+        return self._electrons_s(body.magnitude) * share * self._camera.pixel_scale_rad**2
+
+    def _electrons_s(self, magnitude: float) -> float:
+        """Electrons/s from all of a body."""
+        return self._zero_magnitude_e_s * math.pow(10.0, -0.4 * magnitude)
+
+    def _earthlight(self, earth: EarthLimb) -> float:
+        """Electrons/s per pixel of an Earth with the Sun in the zenith, by Lambert's law."""
+        return self._electrons_s(SUN_V) * earth.albedo / math.pi * self._camera.pixel_scale_rad**2
 
     def _disc_patch(self, moon: Moon, attitude: Attitude) -> tuple[Patch, ...]:
         """Return the disc of Moon or Sun with the terminator; nothing if it is outside the image."""
@@ -316,7 +328,7 @@ class AreaPainter:
         turn = (math.cos(along) / moon.radius_rad, math.sin(along) / moon.radius_rad)
         axes = attitude.to_sensor(np.array([north, east]))
         area = max(math.pi * scale**2 * moon.illuminated, 1.0)
-        shape = (scale, moon.illuminated, self._moonlight(moon) / area)
+        shape = (scale, moon.illuminated, self._electrons_s(moon.magnitude) / area)
         disc, passed = np.empty((2, box[1] - box[0], box[3] - box[2]), dtype=np.float32)
         draw_moon(disc, passed, self._directions, box, (axes, turn, source), shape)
         return (Patch(box, blurred(disc, self._spot_taps), passed, hides_glare=False),)
@@ -342,7 +354,7 @@ class AreaPainter:
         directions = np.ascontiguousarray(self._directions[:, box[0] : box[1], box[2] : box[3]])
         light, passed = np.zeros_like(directions[0]), np.ones_like(directions[0])
         angles = (earth.radius_rad, self._atmosphere_rad(earth))
-        add_earth(light, passed, directions, nadir, sun, angles, earth.electrons_s)
+        add_earth(light, passed, directions, nadir, sun, angles, self._earthlight(earth))
         return [Patch(box, light, passed)]
 
     def _wide_earth(self, earth: EarthLimb, attitude: Attitude) -> WideEarth:
@@ -358,7 +370,7 @@ class AreaPainter:
         distance = 1.0 / math.sin(earth.radius_rad)
         behind = -distance * float(nadir @ sun) if np.any(sun) else 1.0
         step_rad = GLARE_STEP * self._camera.pixel_scale_rad
-        return WideEarth(grid, distance, behind, earth.electrons_s, step_rad)
+        return WideEarth(grid, distance, behind, self._earthlight(earth), step_rad)
 
     def _earth_and_sun(self, earth: EarthLimb, attitude: Attitude) -> tuple[Array, Array]:
         """Return the directions (3,) of the Earth's centre and of its Sun, sensor frame; zeros light all of the disc."""

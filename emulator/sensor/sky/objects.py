@@ -21,6 +21,13 @@ from starid.arrays import Array
 
 _MAX_OBJECTS: Final = 100_000
 
+LENS_SCATTER: Final = 0.012
+"""Fraction of a source's light that a clean lens scatters, falling with the square of the angle: that of ten polished
+surfaces at 10° (Harvey's law with b0 = 0.1/sr, a knee at 0.01 rad and slope −1.5, as FRED assumes them)."""
+
+SUN_V: Final = -26.74
+"""V of the Sun at 1 au (Allen's Astrophysical Quantities, 4th edition)."""
+
 MAX_ROWS: Final = 200
 """Most planets, obstructions, or corners of an obstruction."""
 
@@ -67,7 +74,7 @@ class Moon(CelestialBody):
     """Illuminated fraction of the disc, 0…1."""
     bright_limb_deg: float = limited(-360.0, 360.0, 90.0)
     """Position angle of the midpoint of the bright limb, from north through east."""
-    glare_share: float = limited(0.0, 1.0, 1e-3)
+    glare_share: float = limited(0.0, 1.0, LENS_SCATTER)
     """Fraction of its light that the lens scatters over the field; falls with the square of the angle."""
     reach_deg: float = limited(0.0, 180.0, 180.0)
     """Angle from the boresight beyond which none of its light enters the lens."""
@@ -82,8 +89,9 @@ class Moon(CelestialBody):
 class SunGlare(CelestialBody):
     """The Sun: stray light, and in the field of view a disc whose light, scattered in the lens, saturates the image."""
 
-    electrons_s: float = limited(0.0, 1e12, 1000.0)
-    """Electrons/s per pixel at 30° from the Sun; falls with the cube of the angle."""
+    stray_share: float = limited(0.0, 1.0, 1e-5)
+    """Fraction that a baffle leaves of the light that a bare lens would scatter at 30° from the Sun; falls with the cube
+    of the angle. The default is a point-source transmittance of some 7e-9 at 30° with a 12 mm f/1.2 lens."""
     exclusion_deg: float = limited(0.0, 180.0, 0.0)
     """Angle from the boresight within which sunlight passes the baffle and saturates the image."""
     reach_deg: float = limited(0.0, 180.0, 180.0)
@@ -97,7 +105,7 @@ class SunGlare(CelestialBody):
     @cached_property
     def disc(self) -> Moon:
         """Its disc: the mean diameter and V of the Sun, with the light that a lens scatters from the Moon's."""
-        return Moon(self.ra_deg, self.dec_deg, diameter_deg=0.533, magnitude=-26.74)
+        return Moon(self.ra_deg, self.dec_deg, diameter_deg=0.533, magnitude=SUN_V)
 
 
 @dataclass(frozen=True)
@@ -106,8 +114,8 @@ class EarthLimb(CelestialBody):
 
     radius_deg: float = limited(0.1, 179.0, 64.0)
     """Angular radius of the Earth; 64° at an altitude of 700 km."""
-    electrons_s: float = limited(0.0, 1e12, 1e6)
-    """Electrons/s per pixel of the disc: 0 for the night side, millions for the day side."""
+    albedo: float = limited(0.0, 1.0, 0.3)
+    """Fraction of the sunlight that the disc reflects, in all directions alike; 0 for a dark disc, 0.3 on average."""
     atmosphere_deg: float = limited(1e-3, 20.0, 0.15)
     """Angular height over which the limb fades."""
     exclusion_deg: float = limited(0.0, 180.0, 0.0)
@@ -175,7 +183,7 @@ class SkyObjects:
     missing_stars: int = limited(0, _MAX_OBJECTS, 0)
     """Number of catalogue stars omitted, the brightest in the field."""
     cosmic_rays_s: float = limited(0.0, 1e6, 0.0)
-    """Mean number of particles per second that hit the detector, each leaving a streak."""
+    """Mean number of particles per second that hit the detector, each leaving thousands of electrons in few pixels."""
     blank: bool = False
     """True if no light reaches the detector."""
 

@@ -21,6 +21,21 @@ _J2000_UNIX_S: Final = 946_728_000.0
 _DAY_S: Final = 86_400.0
 
 
+QUIET_CM2_S: Final = 4.0
+ANOMALY_CM2_S: Final = 1000.0
+"""Particles from all directions through a sphere of 1 cm² cross-section, per second: cosmic rays in a low orbit, and protons
+above 30 MeV in the centre of the anomaly at 500 km, after AP-8; other models and solar activity differ by factors of 2."""
+
+
+def default_rates(width: int, height: int, pixel_um: float) -> tuple[float, float]:
+    """Return the particles per second that cross a detector: outside the anomaly, and more in its centre at 500 km.
+
+    Of an isotropic flux, a plane is crossed by half of what a sphere of that cross-section is.
+    """
+    area_cm2 = width * height * (pixel_um * 1e-4) ** 2
+    return 0.5 * QUIET_CM2_S * area_cm2, 0.5 * ANOMALY_CM2_S * area_cm2
+
+
 def sub_satellite_point(position_m: npt.ArrayLike, unix_s: float) -> tuple[float, float, float]:
     """Return the place below a satellite: geocentric latitude and longitude in degrees, altitude in kilometres.
 
@@ -50,13 +65,21 @@ def anomaly_share(latitude_deg: float, longitude_deg: float, altitude_km: float)
 
 
 def particle_rate(
-    quiet_s: float, anomaly_s: float, position_m: npt.ArrayLike | None, unix_s: float | None
+    quiet_s: float | None,
+    anomaly_s: float | None,
+    position_m: npt.ArrayLike | None,
+    unix_s: float | None,
+    defaults: tuple[float, float] = (0.0, 0.0),
 ) -> float:
     """Return the mean number of particles per second that hit the detector.
 
-    There are `quiet_s` outside the anomaly, and `anomaly_s` more in its centre at 500 km. Without a position (3,),
-    GCRS, metres, and a time, only `quiet_s` counts.
+    There are `quiet_s` outside the anomaly, and `anomaly_s` more in its centre at 500 km; for None, those of `defaults`.
+    Without a position (3,), GCRS, metres, and a time, only a given `quiet_s` counts.
     """
-    if position_m is None or unix_s is None or anomaly_s == 0.0:
-        return quiet_s
+    if position_m is None or unix_s is None:
+        return quiet_s or 0.0
+    quiet_s, anomaly_s = (
+        default if given is None else given
+        for given, default in zip((quiet_s, anomaly_s), defaults, strict=True)
+    )
     return quiet_s + anomaly_s * anomaly_share(*sub_satellite_point(position_m, unix_s))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from starhil.emulator.benchmarks.ecss_errors import (
     ErrorSeries,
@@ -25,7 +26,7 @@ NAMES = ["bias", "field-of-view", "pixel", "noise", "thermo-elastic", "aberratio
 
 
 def series(fields: int, conditions: int, repeats: int, rng, **sizes) -> ErrorSeries:
-    """Errors of a nested design; `sizes` are vectors (3,): bias, field, position, noise, of_condition."""
+    """Errors of a nested design; `sizes` are vectors (3,): bias, field, position, noise, swing, of_orbit (v/c)."""
     shape = (fields, conditions, repeats, 3)
     error = np.zeros(shape)
     error += sizes.get("bias", 0.0)
@@ -34,8 +35,17 @@ def series(fields: int, conditions: int, repeats: int, rng, **sizes) -> ErrorSer
     error += rng.standard_normal(shape) * sizes.get("noise", FAINT * SIZE)
     points = np.sin(2.0 * np.pi * np.arange(conditions) / conditions)
     error += points[None, :, None, None] * sizes.get("swing", 0.0)
+    to_sensor = Rotation.random(fields, random_state=12).as_matrix() if fields > 1 else np.eye(3)[None]
+    year = 2.0 * np.pi * np.arange(conditions) / conditions
+    velocity = np.stack(
+        [-np.sin(year), np.cos(year), 0.0 * year], axis=1
+    )  # of a circular orbit, of unit length
+    ecliptic = Rotation.from_euler("x", 23.44, degrees=True).as_matrix()
+    seen = np.einsum("fij,jk,ck->fci", to_sensor, ecliptic, velocity)
+    turn = np.stack([-seen[..., 1], seen[..., 0], 0.0 * seen[..., 0]], axis=-1)
+    error += turn[:, :, None] * sizes.get("of_orbit", 0.0)
     field, condition, _ = np.indices(shape[:3])
-    return ErrorSeries(error.reshape(-1, 3), field.ravel(), condition.ravel())
+    return ErrorSeries(error.reshape(-1, 3), field.ravel(), condition.ravel(), to_sensor[field.ravel()])
 
 
 def lines(kind: int, size, rng, **others):
@@ -45,17 +55,16 @@ def lines(kind: int, size, rng, **others):
     still = series(FIELDS, POSITIONS, REPEATS, rng, **every)
     swing = {"swing": size} if kind == THERMAL else {}
     thermal = thermo_elastic_error(series(FIELDS, POINTS, 1, rng, **every, **swing), CONFIDENCE)
-    dated = {**every}
-    if kind == ABERRATION:
-        dated["position"] = np.hypot(every.get("position", 0.0), size)
+    dated = {**every, "of_orbit": size} if kind == ABERRATION else every
     aberration = aberration_residual(series(FIELDS, DATES, REPEATS, rng, **dated), still, CONFIDENCE)
     return [*static_errors(still, CONFIDENCE), thermal, aberration]
 
 
 @pytest.mark.parametrize("kind", range(6), ids=NAMES)
 def test_an_error_alone_is_recovered_and_appears_in_no_other_line(kind):
-    found = lines(kind, SIZE, np.random.default_rng(100 + kind))
-    expected = SIZE if kind in (BIAS, THERMAL) else coverage_factor(CONFIDENCE) * SIZE
+    size = np.array([7.0, 7.0, 0.0]) if kind == ABERRATION else SIZE
+    found = lines(kind, size, np.random.default_rng(100 + kind))
+    expected = size if kind in (BIAS, THERMAL, ABERRATION) else coverage_factor(CONFIDENCE) * SIZE
     np.testing.assert_allclose(found[kind].arcsec, expected, rtol=0.1)
     faint = coverage_factor(CONFIDENCE) * FAINT * SIZE
     for other in set(range(6)) - {kind}:
@@ -71,12 +80,12 @@ def test_all_kinds_of_error_are_separated():
         "position": np.array([2.0, 2.5, 6.0]),
         "noise": np.array([3.0, 3.5, 9.0]),
     }
-    found = lines(ABERRATION, np.array([8.0, 8.0, 8.0]), rng, **sizes)
+    found = lines(ABERRATION, np.array([8.0, 8.0, 0.0]), rng, **sizes)
     factor = coverage_factor(CONFIDENCE)
     np.testing.assert_allclose(found[BIAS].arcsec, np.abs(sizes["bias"]), rtol=0.25)
     for line, name in ((FIELD, "field"), (PIXEL, "position"), (NOISE, "noise")):
         np.testing.assert_allclose(found[line].arcsec, factor * sizes[name], rtol=0.1)
-    np.testing.assert_allclose(found[ABERRATION].arcsec, factor * 8.0, rtol=0.1)
+    np.testing.assert_allclose(found[ABERRATION].arcsec[:2], 8.0, rtol=0.1)
     assert np.all(found[THERMAL].arcsec == 0.0)
 
 
@@ -84,7 +93,9 @@ def test_frames_without_an_attitude_may_be_missing():
     rng = np.random.default_rng(3)
     whole = series(FIELDS, POSITIONS, REPEATS, rng, field=SIZE, position=SIZE / 2.0, noise=SIZE / 3.0)
     kept = rng.random(len(whole.field)) < 0.7
-    part = ErrorSeries(whole.error_arcsec[kept], whole.field[kept], whole.condition[kept])
+    part = ErrorSeries(
+        whole.error_arcsec[kept], whole.field[kept], whole.condition[kept], whole.to_sensor[kept]
+    )
     _, field, pixel, noise = static_errors(part, CONFIDENCE)
     factor = coverage_factor(CONFIDENCE)
     np.testing.assert_allclose(field.arcsec, factor * SIZE, rtol=0.12)
@@ -98,6 +109,18 @@ def test_an_error_below_the_resolution_is_zero():
     assert np.all(field.arcsec == 0.0)
     assert np.all(pixel.arcsec == 0.0)
     assert np.all(field.resolution_arcsec > 0.05 * SIZE)
+
+
+def test_the_aberration_residual_does_not_exceed_the_aberration():
+    """A star's aberration over a year is at most v/c: 30.29 km/s at perihelion, 20.8″ (Astronomical Almanac)."""
+    rng = np.random.default_rng(8)
+    largest_arcsec = np.degrees(30.29e3 / 299_792_458.0) * 3600.0
+    noise, position = np.array([9.0, 9.0, 21.0]), np.array([3.0, 3.0, 6.0])
+    still = series(80, 4, 4, rng, noise=noise, position=position)
+    dated = series(40, DATES, 2, rng, noise=noise, position=position, of_orbit=20.5)
+    line = aberration_residual(dated, still, CONFIDENCE)
+    assert np.all(line.arcsec[:2] < 1.1 * largest_arcsec)
+    np.testing.assert_allclose(line.arcsec[:2], 20.5, rtol=0.1)
 
 
 def test_without_dates_the_aberration_is_not_evaluated():

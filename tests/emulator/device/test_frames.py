@@ -6,7 +6,7 @@ import pytest
 
 from starhil.emulator.device.cycle import MAX_PENDING
 from starhil.emulator.device.quantities import getter_of
-from starhil.emulator.profile import Profile
+from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.sensor.pipeline.messages import Failure
 from starhil.emulator.truth.source import FixedTruth
 from starhil.protocol.messages import ErrorCode
@@ -184,3 +184,29 @@ def test_a_pipeline_that_fails_makes_frames_invalid_and_is_logged_once_until_it_
         reading = bench.read("precise_attitude")
         assert (reading["valid"], reading["reason"]) == (valid, "ok" if valid else "processing_error")
     assert caplog.text.count("out of memory") == 2
+
+
+def test_cubestar_processes_an_image_while_it_takes_the_next_one_as_in_erlanks_table(make_bench):
+    """Erlank (2013), table 6.2, cycle of 1000 ms: idle 140 ms, imager on 68 ms, "expose and process previous image" 388 ms,
+    transfer of the image 404 ms; 396.2 mW on average at 3.3 V. A result comes during the next period's exposure."""
+    bench = make_bench(load_profile("cubestar", ["run.clock=stepped"])).start()
+    bench.command("set_mode", mode="lost_in_space")
+    phases = []
+    bench.step(4.0)
+    for _ in range(1000):
+        bench.step(0.001)
+        phases.append(bench.device.snapshot().phase.value)
+    lasting = {name: phases.count(name) for name in set(phases)}
+    published = {"idle": 140, "imager_on": 68, "exposure": 388, "transfer": 404}
+    assert lasting == pytest.approx(published, abs=2)
+    currents_ma = {"idle": 71.2, "imager_on": 121.2, "exposure": 177.3, "transfer": 81.81}
+    assert 3.3 * sum(currents_ma[name] * lasting[name] for name in lasting) / 1e3 == pytest.approx(
+        396.2, rel=0.01
+    )
+    changes = [name for name, before in zip(phases, [phases[-1], *phases], strict=False) if name != before]
+    start = changes.index("exposure")
+    assert changes[start:] + changes[:start] == ["exposure", "transfer", "idle", "imager_on"]
+    latency_s = bench.read("precise_attitude")["latency"] / 1e3
+    assert 1.0 - 0.15 < latency_s < 1.0 - 0.15 + 0.388 + 0.005
+    assert latency_s == pytest.approx(1.238, abs=0.005)
+    assert bench.read("precise_attitude")["reason"] == "ok"

@@ -1,3 +1,4 @@
+import math
 from itertools import permutations
 from pathlib import Path
 
@@ -11,10 +12,12 @@ from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.profile.pipeline_setup import pipeline_setup
 from starhil.emulator.profile.profile import CALIBRATION, OF_FAULTS
 from starhil.emulator.run.faults import DeviceFault, FaultRequest
+from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifierSetup
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.truth.config import SlewConfig
 from starhil.protocol.files.bundled import bundled
 from starid.camera import Camera
+from starid.catalog import load_catalog
 
 
 def write(tmp_path, text, name="mine.toml"):
@@ -405,3 +408,18 @@ def test_a_device_in_place_of_a_profile_is_rejected(tmp_path):
 @pytest.mark.parametrize("text", ["42", '"42"', "'42'"])
 def test_a_kind_that_looks_like_a_number_is_a_name(text):
     assert load_profile("cubestar", [f"truth.kind={text}"]).truth.kind == "42"
+
+
+def test_cubestar_2013_has_the_field_and_the_catalogue_that_its_maker_published():
+    """50° × 26° and 410 stars to V 3.8 (Erlank, 2nd Interplanetary CubeSat Workshop, 2013)."""
+    profile = load_profile("cubestar-2013")
+    camera, limit = profile.camera, profile.parameters["limiting_magnitude"]
+    fields = [
+        math.degrees(2.0 * math.atan(0.5 * size / focal))
+        for size, focal in zip((camera.width, camera.height), camera.focal_px, strict=True)
+    ]
+    assert fields == pytest.approx([50.0, 26.0], abs=0.1)
+    setup = StarIdentifierSetup(
+        "geometric", Camera.from_dict(camera.values()), 1.0, (("limiting_magnitude", limit),)
+    )
+    assert len(setup.make(load_catalog(epoch=profile.epoch)).stars) == pytest.approx(410, abs=5)

@@ -71,7 +71,7 @@ def test_a_jump_with_a_moon_in_the_corner_loses_the_prediction_and_is_not_blinde
 
 
 def test_the_earth_across_the_field_blinds_the_sensor(pipeline):
-    earth = {"ra_deg": 83.8, "dec_deg": -1.2, "electrons_s": 1e6}
+    earth = {"ra_deg": 83.8, "dec_deg": -1.2}
     result = pipeline.handle(replace(REQUEST, faults={"earth": earth}))
     assert (result.valid, result.reason, result.in_field) == (False, "blinded", ("earth",))
 
@@ -85,7 +85,7 @@ def test_the_sun_in_the_field_blinds_the_sensor(pipeline, off_deg):
 
 def test_the_sun_within_its_exclusion_angle_blinds_the_sensor_unless_the_lens_is_covered(pipeline):
     def seen(off_deg, **others):
-        sun = {"ra_deg": 83.8, "dec_deg": -1.2 + off_deg, "exclusion_deg": 40.0, "electrons_s": 100.0}
+        sun = {"ra_deg": 83.8, "dec_deg": -1.2 + off_deg, "exclusion_deg": 40.0, "stray_share": 1e-6}
         return pipeline.handle(replace(REQUEST, faults={"sun": sun, **others}))
 
     assert (seen(39.0).valid, seen(39.0).reason, seen(39.0).in_field) == (False, "blinded", ("sun",))
@@ -117,7 +117,7 @@ def test_the_modelled_direction_of_a_star_is_that_of_the_catalogue_not_the_measu
 
 
 def test_an_image_that_is_saturated_all_over_cannot_be_searched(pipeline):
-    glare = {"sun": {"ra_deg": 150.0, "dec_deg": 0.0, "electrons_s": 1e8}}
+    glare = {"sun": {"ra_deg": 150.0, "dec_deg": 0.0, "stray_share": 1.0}}
     result = pipeline.handle(replace(REQUEST, index=14, faults=glare))
     assert (result.valid, result.reason, result.detected) == (False, "detection_failed", 0)
 

@@ -181,7 +181,7 @@ def test_the_sun_fades_while_its_disc_sets_behind_the_earth():
         off = radius + math.radians(above)
         place = -7e6 * (math.cos(off) * towards + math.sin(off) * side)
         seen = BY_DATE.view(NEW_YEAR, place, np.zeros(3)).objects.sun
-        shares.append(0.0 if seen is None else seen.electrons_s / sun.electrons_s)
+        shares.append(0.0 if seen is None else seen.stray_share / sun.stray_share)
     assert shares[0] == 0.0
     assert shares[2] == pytest.approx(0.5, abs=0.02)
     assert shares[4] == pytest.approx(1.0)
@@ -306,7 +306,9 @@ def test_light_that_passes_the_baffle_saturates_the_image():
     renderer = Renderer(Camera.from_fov(42.0, 128, 128), load_catalog(), SensorModel())
     inside, outside = (
         renderer.render(
-            Attitude.from_radec_roll(objects.sun.ra_deg, objects.sun.dec_deg + off, 0.0), objects=objects
+            Attitude.from_radec_roll(objects.sun.ra_deg, objects.sun.dec_deg + off, 0.0),
+            exposure_s=0.02,
+            objects=objects,
         ).image
         for off in (29.0, 31.0)
     )
@@ -349,11 +351,11 @@ def test_given_bodies_replace_or_change_those_of_the_date():
 
 @pytest.mark.parametrize("bodies", ["typed", "ephemeris"])
 def test_a_body_that_a_fault_places_looks_as_in_the_profile(bodies):
-    sky = Sky({"bodies": bodies, "sun": {"exclusion_deg": 40.0, "electrons_s": 7.0}})
+    sky = Sky({"bodies": bodies, "sun": {"exclusion_deg": 40.0, "stray_share": 7e-5}})
     if bodies == "typed":
         assert sky.view(NEW_YEAR).objects.sun is None
-    sun = sky.view(NEW_YEAR, faults={"sun": {"ra_deg": 1.0, "dec_deg": 2.0, "electrons_s": 8.0}}).objects.sun
-    assert (sun.ra_deg, sun.dec_deg, sun.exclusion_deg, sun.electrons_s) == (1.0, 2.0, 40.0, 8.0)
+    sun = sky.view(NEW_YEAR, faults={"sun": {"ra_deg": 1.0, "dec_deg": 2.0, "stray_share": 8e-5}}).objects.sun
+    assert (sun.ra_deg, sun.dec_deg, sun.exclusion_deg, sun.stray_share) == (1.0, 2.0, 40.0, 8e-5)
 
 
 @pytest.mark.parametrize(

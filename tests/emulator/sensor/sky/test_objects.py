@@ -70,7 +70,7 @@ def test_the_lit_limb_points_in_the_given_direction(renderer: Renderer) -> None:
 
 
 def test_the_sun_brightens_the_side_where_it_is(renderer: Renderer) -> None:
-    image = renderer.render(ORION, objects=SkyObjects(sun=SunGlare(83.8, 40.0, 2000.0))).image
+    image = renderer.render(ORION, objects=SkyObjects(sun=SunGlare(83.8, 40.0, 2e-5))).image
     top, bottom = np.median(image[:50]), np.median(image[-50:])
     offset = renderer.sensor.offset_dn
     assert top - offset > 4.0 * (bottom - offset)
@@ -91,9 +91,9 @@ def test_a_short_exposure_shows_the_disc_of_the_sun(renderer: Renderer) -> None:
     assert half_px == pytest.approx(0.2665 / np.degrees(DEFAULT_CAMERA.pixel_scale_rad), abs=0.5)
 
 
-@pytest.mark.parametrize("electrons_s", [0.0, 2e6])
-def test_the_earth_covers_stars_behind_it(renderer: Renderer, electrons_s: float) -> None:
-    earth = EarthLimb(83.8, -70.0, radius_deg=64.0, electrons_s=electrons_s)
+@pytest.mark.parametrize("albedo", [0.0, 0.3])
+def test_the_earth_covers_stars_behind_it(renderer: Renderer, albedo: float) -> None:
+    earth = EarthLimb(83.8, -70.0, radius_deg=64.0, albedo=albedo)
     frame = renderer.render(ORION, objects=SkyObjects(earth=earth))
     vectors = DEFAULT_CAMERA.back_project(frame.stars.xy_px)
     distance = np.degrees(np.arccos(vectors @ ORION.to_sensor(icrs_vector(83.8, -70.0))))
@@ -102,7 +102,7 @@ def test_the_earth_covers_stars_behind_it(renderer: Renderer, electrons_s: float
     assert frame.objects is not None
     assert 0.2 < frame.objects.covered_share < 0.6
     below = np.median(frame.image[-40:])
-    assert below == renderer.sensor.max_dn if electrons_s else below <= np.median(frame.image[:40])
+    assert below == renderer.sensor.max_dn if albedo else below <= np.median(frame.image[:40])
 
 
 @pytest.mark.parametrize("sun", [None, (60.0, 20.0), (150.0, -40.0)])
@@ -114,7 +114,7 @@ def test_a_wide_earth_matches_a_computation_per_pixel(
     camera = Camera.from_fov(20.0, width=440, height=440)
     lit = {} if sun is None else {"sun_ra_deg": sun[0], "sun_dec_deg": sun[1]}
     earth = EarthLimb(83.8, -1.0 - radius_deg, radius_deg=radius_deg, atmosphere_deg=0.2, **lit)
-    objects = SkyObjects(earth=earth, sun=SunGlare(83.8, 60.0, 2000.0))
+    objects = SkyObjects(earth=earth, sun=SunGlare(83.8, 60.0, 2e-5))
     flat = np.ones((camera.height, camera.width), dtype=np.float32)
     ones = flat.astype(np.uint16)
     pixels = np.argwhere(flat)[::97, ::-1].astype(np.float64)
@@ -129,14 +129,15 @@ def test_a_wide_earth_matches_a_computation_per_pixel(
 
     mean, visible, share = painted(0.0)
     expected, expected_visible, expected_share = painted(90.0)
-    np.testing.assert_allclose(mean, expected, atol=0.012 * earth.electrons_s)
+    daylight = 1.8e6 * 10.0 ** (0.4 * 26.74) * 0.3 / np.pi * camera.pixel_scale_rad**2
+    np.testing.assert_allclose(mean, expected, atol=0.012 * daylight)
     np.testing.assert_allclose(visible, expected_visible, atol=0.008)
     assert share == pytest.approx(expected_share, abs=0.02)
     assert 0.3 < share < 0.7
 
 
 def test_glare_around_a_source_in_the_field_matches_a_computation_per_pixel(renderer: Renderer) -> None:
-    """Within 0.5 electrons, 4 % of the read noise, of strength/(chord² + softness²) in every pixel."""
+    """Within 0.5 % or 0.5 electrons, 4 % of the read noise, of strength/(chord² + softness²) in every pixel."""
     camera, moon = DEFAULT_CAMERA, Moon(80.0, 2.0, magnitude=-12.7)
     light = AreaPainter(camera, renderer.sensor.zero_magnitude_e_s, 0.8).paint(SkyObjects(moon=moon), ORION)
     zero = np.zeros((camera.height, camera.width), dtype=np.float32)
@@ -148,7 +149,7 @@ def test_glare_around_a_source_in_the_field_matches_a_computation_per_pixel(rend
     total = renderer.sensor.electrons(-12.7, 0.2) * moon.glare_share * camera.pixel_scale_rad**2
     expected = total / (2.0 * np.pi * np.log(100.0)) / (chord2 + np.radians(0.3) ** 2)
     outside = chord2 > np.radians(0.8) ** 2
-    np.testing.assert_allclose(mean[y.ravel(), x.ravel()][outside], expected[outside], atol=0.5)
+    np.testing.assert_allclose(mean[y.ravel(), x.ravel()][outside], expected[outside], rtol=0.005, atol=0.5)
 
 
 def test_a_straight_edge_covers_the_share_asked_for(renderer: Renderer) -> None:
@@ -200,13 +201,13 @@ def test_planets_are_points_at_their_directions(renderer: Renderer) -> None:
     assert np.linalg.norm(found.xy_px - place(83.0, 3.0), axis=1).min() < 0.1
 
 
-def test_particles_leave_streaks_at_their_true_positions(renderer: Renderer) -> None:
+def test_particles_leave_charge_at_their_true_positions(renderer: Renderer) -> None:
     frame = renderer.render(ORION, objects=SkyObjects(cosmic_rays_s=200.0))
     plain = renderer.render(ORION)
     assert frame.objects is not None
-    streaks = frame.objects.cosmic_rays_px
-    assert 15 <= len(streaks) <= 70
-    middles = 0.5 * (streaks[:, :2] + streaks[:, 2:])
+    tracks = frame.objects.cosmic_rays_px
+    assert 15 <= len(tracks) <= 70
+    middles = 0.5 * (tracks[:, :2] + tracks[:, 2:])
     middles = middles[np.all((middles > 5.0) & (middles < 930.0), axis=1)]
     brighter = [mean_around(frame.image, xy, 0) > mean_around(plain.image, xy, 0) + 50.0 for xy in middles]
     assert np.mean(brighter) > 0.9
