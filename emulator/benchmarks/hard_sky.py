@@ -23,7 +23,7 @@ _PLANETS: Final = 3
 _PLANET_MAGNITUDES: Final = (-4.0, 1.5)
 _WITHIN_DEG: Final = 20.0
 _SUN_AWAY_DEG: Final = (30.0, 80.0)
-_SUN_ELECTRONS_S: Final = (100.0, 3000.0)
+_SUN_STRAY_SHARE: Final = (1e-6, 3e-5)
 _COSMIC_RAYS_S: Final = 50.0
 
 
@@ -43,7 +43,7 @@ def hard_sky(attitude: Attitude, rng: np.random.Generator) -> SkyObjects:
             bright_limb_deg=float(rng.uniform(0.0, 360.0)),
         )
     else:
-        sun = SunGlare(*direction_around(attitude, _SUN_AWAY_DEG, rng), float(rng.uniform(*_SUN_ELECTRONS_S)))
+        sun = SunGlare(*direction_around(attitude, _SUN_AWAY_DEG, rng), float(rng.uniform(*_SUN_STRAY_SHARE)))
     return SkyObjects(
         moon=moon,
         sun=sun,

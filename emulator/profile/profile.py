@@ -179,6 +179,9 @@ OF_CAMERA: Final = CALIBRATION | {"limiting_magnitude"}
 PATHS: Final = profile_paths(Profile)
 """Keys of files and folders, which refer to the folder of the profile that has them."""
 
+_LONGEST_SHOWN: Final = 200
+"""Longest part of a `--set` that an error repeats before it says what is wrong with it, characters."""
+
 _A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
 OF_FAULTS: Final = dict.fromkeys(
     ("fault", "faults", "optical", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
@@ -412,4 +415,5 @@ def _apply_override(values: dict[str, Any], override: str) -> Layer:
     layer: Any = value
     for name in reversed(names):
         layer = {name: layer}
-    return f"--set {override}", layer
+    shown = override if len(override) <= _LONGEST_SHOWN else f"{override[:_LONGEST_SHOWN]}…"
+    return f"--set {shown}", layer

@@ -35,7 +35,7 @@ def test_a_report_that_cannot_be_written_is_rejected_before_the_run(words, tmp_p
         raise AssertionError("the run began")
 
     monkeypatch.setattr(conformance_run, "_start_emulator", never)
-    monkeypatch.setattr(session_run, "Bench", never)
+    monkeypatch.setattr(session_run, "Rig", never)
     monkeypatch.chdir(tmp_path)
     outcome = run_command(*words, ".", "--start")
     assert isinstance(outcome.exception, BenchError), outcome.exception
@@ -132,7 +132,7 @@ def test_a_report_into_a_device_leaves_the_device(tmp_path):
 def test_a_report_into_the_standard_output_comes_between_the_lines_printed_there(tmp_path):
     file = tmp_path / "output"
     code = (
-        "from pathlib import Path; from starhil.hil_tests.session.results import write_report; "
+        "from pathlib import Path; from starhil.hil_tests.reports import write_report; "
         "print('before'); write_report(Path('/dev/stdout'), b'<report/>'); print('after')"
     )
     with file.open("wb") as stream:

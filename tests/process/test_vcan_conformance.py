@@ -17,6 +17,7 @@ SPEED = 0.5
 def test_every_case_passes_on_the_kernel_bus():
     outcomes = conform("--start", "--can", "auto", "--canopen", "44", "--speed", str(SPEED))
     passed = [item["id"] for item in outcomes if item["status"] == "passed"]
-    assert len(passed) == len(outcomes)
+    others = [item for item in outcomes if item["status"] != "passed"]
+    assert {(item["status"], item["id"].split(".")[1]) for item in others} <= {("skipped", "unjudged")}
     assert sum(identifier.startswith("can.") for identifier in passed) >= 380
     assert sum(identifier.startswith("canopen.") for identifier in passed) >= 140

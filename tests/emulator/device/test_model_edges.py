@@ -34,6 +34,6 @@ def test_the_bit_rate_is_that_of_the_unit_unless_the_profile_gives_one(links, ba
 
 
 def test_a_quantity_that_is_declared_twice_is_an_error():
-    """The second declaration would replace the first, and change the rows that report it."""
-    with pytest.raises(ValueError, match=r"frame\.late is declared twice"):
-        quantities._quantity("frame.late", bool, "", "Late.", lambda _shot: True)
+    """The second function would replace the first, and change the rows that report it."""
+    with pytest.raises(ValueError, match=r"frame\.late has two functions"):
+        quantities._quantity("frame.late", lambda _shot: True)

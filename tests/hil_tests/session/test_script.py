@@ -12,7 +12,7 @@ from starhil.hil_tests.session.expect import Variable
 from starhil.hil_tests.session.script import load_script
 from starhil.hil_tests.session.session_run import find_script
 from starhil.hil_tests.session.steps import Command, Read, Sample, Send
-from starhil.protocol.files.bundled import bundled
+from starhil.protocol.files.bundled import bundled, bundled_units
 from starhil.protocol.unit import load_unit
 
 ICD = load_unit()
@@ -360,6 +360,7 @@ def test_a_missing_file_is_rejected_with_near_names(tmp_path):
 
 @pytest.mark.parametrize("path", bundled("session").values(), ids=lambda path: path.stem)
 def test_the_included_scripts_are_valid(path):
-    script = load_script(path, ICD)
+    unit = path.stem.partition("_")[0]
+    script = load_script(path, load_unit(unit) if unit in bundled_units() else ICD)
     assert script.steps
     assert script.doc

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from starhil.protocol import errors as names
 from starhil.protocol.errors import LONGEST_PROBLEM, MAX_PROBLEMS, ProtocolError
-from starhil.protocol.files import bundled as names
 from starhil.protocol.files.validation import problems
 
 

@@ -413,7 +413,9 @@ def test_a_value_that_a_map_lacks_is_reported_as_the_one_that_stands_for_it(
     monkeypatch.setattr("starhil.protocol.icd.definition.device_model", lambda: newer)
     members = '"1" = ["boot", "standby"], "2" = "lost_in_space", "3" = "tracking", "9" = "error"'
     field = f'{{ name = "mode", type = "u8", value = "mode", map = {{ {members} }} }}'
-    (tmp_path / "x.toml").write_text(f"{HEAD}{LINK}{ROW}fields = [{field}]\n", encoding="utf-8")
+    (tmp_path / "x.toml").write_text(
+        f"{HEAD}{LINK}{ROW}fields = [{field}]\n".replace("id = 1\n", "id = 130\n"), encoding="utf-8"
+    )
     row = load_unit(tmp_path).telemetry["row"]
     assert row.named_fields["mode"].aliases == {"standby": "boot", "survey": "boot"}
     known.instead.clear()

@@ -14,8 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from starid import catalog
-from starid.catalog import StarCatalog, hipparcos, load_catalog
+from starid.catalog import StarCatalog, catalog, hipparcos, load_catalog
 from starid.catalog.catalog import companions, merge_close_stars
 from starid.catalog.photometry import absolute_magnitude, fitted_share, flux_ratio, v_from_hp
 from starid.errors import StaridError

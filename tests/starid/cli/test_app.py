@@ -114,7 +114,7 @@ def test_a_profile_that_the_emulator_does_not_have_ends_with_one_line(
     )
     assert (status, out) == (2, "")
     assert said.startswith("starid: profile 'cubestarr': not found; ")
-    assert said.endswith("did you mean cubestar?\n")
+    assert said.endswith("did you mean cubestar, cubestar-2013?\n")
     assert said.count("\n") == 1
 
 

@@ -184,7 +184,7 @@ def test_images_that_cannot_be_written_are_rejected(tmp_path: Path) -> None:
 
 
 def test_public_names_are_available_from_the_package() -> None:
-    assert starid.Camera.__module__ == "starid.camera"
+    assert starid.Camera.__module__ == "starid.camera.camera"
     assert "load_catalog" in dir(starid)
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = starid.nonsense

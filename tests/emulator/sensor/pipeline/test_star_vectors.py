@@ -20,8 +20,9 @@ ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 
 def solved(focal_factor: float, shift_px: float, **identifier: float) -> tuple[FrameResult, Pipeline]:
     profile = Profile.model_validate({"run": {"clock": "stepped"}, "identifier": identifier})
-    pipeline = Pipeline(pipeline_setup(profile))
-    request = FrameRequest(0, TruthState(ORION, ZERO_RATE), 0.1, 1.0)
+    setup = pipeline_setup(profile)
+    pipeline = Pipeline(setup)
+    request = FrameRequest(0, TruthState(ORION, ZERO_RATE), 0.1, 1.0, setup.settings)
     optics = camera_constants(pipeline.camera.to_dict())
     calibrated = {
         **optics,
