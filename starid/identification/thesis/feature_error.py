@@ -1,8 +1,8 @@
 """How far an attitude from features alone is off, measured on simulated fields of the same camera and database.
 
 The answer of algorithm 1 is either right to a fraction of a cell, or somewhere else in the sky: a star on the wrong side
-of the brightness limit changes all five features. The smaller ε_ψ is, the rarer is the second. The mean square of the
-errors of simulated fields with a similar ε_ψ, gross ones included, is therefore the covariance that an answer has.
+of the brightness limit changes all five features. The smaller ε_ψ is, the rarer is the second. The covariance of an
+answer is the mean of both, weighted with the probability of the second.
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ import numpy as np
 from starid.arrays import Array
 from starid.attitude import Attitude, random_attitude
 from starid.identification.thesis.feature_search import FeatureSearch
-from starid.identification.thesis.frame_sky import FrameSky
 
 FIELDS: Final = 800
 """Number of simulated fields."""
 
+RIGHT_DEG: Final = 1.5
+"""Error of the boresight up to which an answer is at the right place of the sky, degrees."""
+
 _SEED: Final = 20_221_017
-_BINS: Final = 8
+_CLASSES: Final = 8
 _SLOPE_MAG: Final = 0.2
 """Width of the magnitudes over which the share of stars found falls from 90 to 50 %."""
 _FLOOR_MAG: Final = 0.03
@@ -57,64 +59,73 @@ class Photometry:
 
 @dataclass(frozen=True, eq=False)
 class FeatureErrors:
-    """Covariance of an attitude from features, by ε_ψ.
+    """Errors of an attitude from features, by classes of ε_ψ.
 
     Attributes
     ----------
     upper
         Largest ε_ψ of each class, (k,).
-    across, about
-        Mean square rotation about each axis across the boresight, and about the boresight, rad², (k,).
+    wrong
+        Share of answers from the whole database at another place of the sky, (k,).
+    right
+        Mean square rotation of the others about an axis across the boresight, and about the boresight, rad², (k, 2).
+    gross
+        The same for those at another place, (2,).
+    ratio
+        How much more often a region at another place has such an ε_ψ than the region of the true place, (k,).
     """
 
     upper: Array
-    across: Array
-    about: Array
+    wrong: Array
+    right: Array
+    gross: Array
+    ratio: Array
 
-    def covariance(self, error_psi: float) -> Array:
-        """Covariance of the rotation vector in the sensor frame, rad², (3, 3)."""
-        row = min(int(np.searchsorted(self.upper, error_psi)), self.upper.size - 1)
-        return np.diag([self.across[row], self.across[row], self.about[row]])
+    def row(self, error_psi: float) -> int:
+        """The class of an ε_ψ."""
+        return min(int(np.searchsorted(self.upper, error_psi)), self.upper.size - 1)
+
+    def covariance(self, error_psi: float, wrong: float) -> Array:
+        """Covariance of the rotation vector in the sensor frame, rad², (3, 3); `wrong` is the probability of another place."""
+        across, about = (1.0 - wrong) * self.right[self.row(error_psi)] + wrong * self.gross
+        return np.diag([across, across, about])
 
     @classmethod
-    def of_search(
-        cls, search: FeatureSearch, sky: FrameSky, photometry: Photometry, side_deg: float | None = None
-    ) -> Self:
-        """Measure the errors on simulated fields of stars from `sky`.
-
-        With `side_deg` the search is that of a region of this side, whose centre is off by up to a quarter of it.
-        """
+    def of_search(cls, search: FeatureSearch, photometry: Photometry, side_deg: float) -> Self:
+        """Measure the errors on simulated fields, in the whole database and in regions of a side in degrees."""
         rng = np.random.default_rng(_SEED)
-        psi, errors = [], []
+        psi, errors, here, elsewhere = [], [], [], []
         for _ in range(FIELDS):
-            truth = Attitude.from_radec_roll(*_place(rng), 0.0)
-            brightness, offsets, _ = sky.stars_in_frame(truth.ra_deg, truth.dec_deg)
-            magnitude = photometry.measured(rng, brightness)
-            field = search.field_of(offsets, magnitude)
-            features = search.features(field)
+            truth, other = random_attitude(rng), random_attitude(rng)
+            truth = Attitude.from_radec_roll(truth.ra_deg, truth.dec_deg, 0.0)
+            brightness, offsets, _ = search.stars.stars_in_frame(truth.ra_deg, truth.dec_deg)
+            features = search.features(search.field_of(offsets, photometry.measured(rng, brightness)))
             if features is None:
                 continue
-            if side_deg is None:
-                answer = search.answer(features)
-            else:
-                shift = np.radians(rng.uniform(-0.25 * side_deg, 0.25 * side_deg, 2))
-                found = search.answer_in_region(features, truth.rotated((*shift, 0.0)), side_deg)
-                if found is None:
-                    continue
-                answer = found
+            answer = search.answer(features)
             psi.append(answer.error_psi)
             errors.append(answer.attitude.error_to(truth).rotation_vector_rad)
-        order = np.argsort(psi)
-        classes = np.array_split(order, _BINS)
+            for centre, found in ((truth, here), (other, elsewhere)):
+                local = search.answer_in_region(features, centre, side_deg)
+                if local is not None:
+                    found.append(local.error_psi)
         squares = np.array(errors) ** 2
-        return cls(
-            np.array([np.array(psi)[rows].max() for rows in classes]),
-            np.array([squares[rows, :2].mean() for rows in classes]),
-            np.array([squares[rows, 2].mean() for rows in classes]),
+        upper = np.quantile(psi, np.arange(1, _CLASSES + 1) / _CLASSES)
+        upper[-1] = math.inf
+        rows = np.searchsorted(upper, psi)
+        lost = np.sqrt(squares[:, 0] + squares[:, 1]) > math.radians(RIGHT_DEG)
+        right = np.array([_mean_squares(squares[(rows == row) & ~lost]) for row in range(_CLASSES)])
+        count = np.bincount(rows, minlength=_CLASSES)
+        wrong = (np.bincount(rows[lost], minlength=_CLASSES) + 0.5) / (count + 1.0)
+        likely, unlikely = (
+            (np.bincount(np.searchsorted(upper, found), minlength=_CLASSES) + 0.5) / (len(found) + 0.5 * _CLASSES)
+            for found in (here, elsewhere)
         )
+        return cls(upper, wrong, right, _mean_squares(squares[lost]), unlikely / likely)
 
 
-def _place(rng: np.random.Generator) -> tuple[float, float]:
-    """A random boresight, uniform on the sphere, degrees."""
-    attitude = random_attitude(rng)
-    return attitude.ra_deg, attitude.dec_deg
+def _mean_squares(squares: Array) -> Array:
+    """Mean of squared rotations (n, 3) across and about the boresight, (2,); that of a degree if there are none."""
+    if len(squares) == 0:
+        return np.full(2, math.radians(RIGHT_DEG) ** 2)
+    return np.array([squares[:, :2].mean(), squares[:, 2].mean()])

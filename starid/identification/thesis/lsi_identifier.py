@@ -49,6 +49,9 @@ STARS_PER_FIELD: Final = 10
 """Number of stars per field for the default brightness limit of the features: fewer make fields alike, and with more
 some are always on the wrong side of the limit."""
 
+REGION_DEG: Final = 2.0
+"""Least side of a region of search, degrees."""
+
 STARS_PER_MATCH: Final = 60
 """Number of stars per field that are paired with detections."""
 
@@ -129,8 +132,8 @@ class LsiOptions:
     """
 
     refinement: bool = True
-    tau: float = 1.0
-    invalid_factor: float = 5.0
+    tau: float = 0.5
+    invalid_factor: float = 10.0
     feature_limit: float | None = None
     detected_limit: float | None = None
     magnitude_sigma: float = _DEFAULT_SIGMA_MAG
@@ -223,16 +226,15 @@ class LsiIdentifier(VerifiedIdentifier):
             if options.refinement
             else None
         )
-        self.errors = None if options.refinement else self.feature_errors(None)
+        self.errors = None if options.refinement else self._feature_errors()
         self.last_report = LsiReport(None, 0, 0, math.nan)
 
-    def feature_errors(self, side_deg: float | None) -> FeatureErrors:
-        """Errors of the first stage in the whole database, or in a region of a side in degrees."""
+    def _feature_errors(self) -> FeatureErrors:
         limit = self.options.detected_limit
         photometry = Photometry(
             self.database.parameters.kappa + 1.0 if limit is None else limit, self.options.magnitude_sigma
         )
-        return FeatureErrors.of_search(self.search, self.search.stars, photometry, side_deg)
+        return FeatureErrors.of_search(self.search, photometry, REGION_DEG)
 
     def _seen_stars(self, limit: float) -> StarCatalog:
         """Stars to a magnitude as the sensor sees them: unresolved ones merged, with its own magnitudes as `v`."""
@@ -372,17 +374,22 @@ class LsiIdentifier(VerifiedIdentifier):
         self.last_report = LsiReport(None, 0, 0, math.nan)
         return Solution.invalid(Reason.TOO_FEW_STARS)
 
-    def by_features_alone(self, answer: FeatureAnswer, errors: FeatureErrors | None = None) -> Solution:
-        """The solution of the first stage: invalid if ε_ψ > K·τ, otherwise with the error of simulated fields."""
+    def by_features_alone(self, answer: FeatureAnswer, wrong: float | None = None) -> Solution:
+        """The solution of the first stage; invalid if ε_ψ > K·τ.
+
+        `wrong` is the probability that it is at another place of the sky; by default that of the whole database.
+        """
         report = report_of(answer, "lsi")
-        known = errors or self.errors
-        if known is None or answer.error_psi > self.options.invalid_factor * self.options.tau:
+        psi = answer.error_psi
+        if self.errors is None or psi > self.options.invalid_factor * self.options.tau:
             return dataclasses.replace(Solution.invalid(Reason.RESIDUAL), features=report)
+        likely = float(self.errors.wrong[self.errors.row(psi)]) if wrong is None else wrong
         return Solution(
             valid=True,
             reason=Reason.OK,
             quaternion_xyzw=answer.attitude.quaternion_xyzw,
-            covariance=known.covariance(answer.error_psi),
+            covariance=self.errors.covariance(psi, likely),
+            probability_false=likely,
             features=report,
         )
 

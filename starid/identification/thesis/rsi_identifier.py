@@ -25,11 +25,12 @@ from starid.identification.solution import FeatureReport, Solution
 from starid.identification.thesis.cme import matched_motion
 from starid.identification.thesis.false_stars import ObservedFrame
 from starid.identification.thesis.feature_search import ESTIMATE_SHARE, FeatureAnswer, FieldStars
-from starid.identification.thesis.lsi_identifier import WINDOW_PX, LsiIdentifier, LsiOptions, report_of
+from starid.identification.thesis.lsi_identifier import REGION_DEG, WINDOW_PX, LsiIdentifier, LsiOptions, report_of
 from starid.identification.thesis.rsi import RsiSettings, region_side
 from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings, rays
 
 _MIN_MATCHES: Final = 3
+_LEAST_WRONG: Final = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +74,7 @@ class RsiOptions(LsiOptions):
         One-sigma error of a position per axis, pixels, as assumed by the filter.
     """
 
-    gamma_min_deg: float = 2.0
+    gamma_min_deg: float = REGION_DEG
     gamma_scale: float = 1.0
     filter_false_stars: bool = True
     position_sigma_px: float = 0.5
@@ -161,9 +162,9 @@ class RsiIdentifier(SingleCameraIdentifier):
             if options.filter_false_stars
             else None
         )
-        self._region_errors = None if options.refinement else self.lsi.feature_errors(options.gamma_min_deg)
         self._before: ObservedFrame | None = None
         self._last: Attitude | None = None
+        self._wrong = 1.0
         self.statistics = RsiStatistics()
 
     @property
@@ -191,7 +192,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         """Find the attitude in the whole database, from the stars that the filter keeps."""
         known = self._preprocess(measured.xy, measured.flux)
         solution = self._whole_sky(measured, known)
-        self._last = solution.attitude if solution.valid else None
+        self._remember(solution)
         return dataclasses.replace(solution, features=known.add_to(solution.features))
 
     def _whole_sky(
@@ -221,14 +222,31 @@ class RsiIdentifier(SingleCameraIdentifier):
                 side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
         side = min(side, self.lsi.database.parameters.fov_deg)
         field, answer = self._in_region(measured, known, centre, side)
-        solution = None if field is None or answer is None else self._accepted(measured, field, answer)
+        solution = None if field is None or answer is None else self._accepted(measured, known, field, answer)
         triggered = solution is None
         if solution is None:
             solution = self._whole_sky(measured, known, () if answer is None else (answer,))
         self._count(solution, side, triggered=triggered)
-        self._last = solution.attitude if solution.valid else None
+        self._remember(solution)
         report = known.add_to(solution.features, triggered=triggered, region_deg=side)
         return dataclasses.replace(solution, features=report)
+
+    def _remember(self, solution: Solution) -> None:
+        self._last = solution.attitude if solution.valid else None
+        self._wrong = solution.probability_false
+
+    def _place_wrong(self, answer: FeatureAnswer, known: Preprocessed) -> float:
+        """Probability that the region is at another place of the sky, by Bayes' rule from the last image's.
+
+        The features say something new only as far as other stars are seen: in proportion to the motion, up to a cell.
+        """
+        errors = self.lsi.errors
+        if errors is None:
+            return self._wrong
+        new = min(known.translation_deg / self.lsi.database.grid.step_deg, 1.0)
+        odds = self._wrong / max(1.0 - self._wrong, _LEAST_WRONG)
+        odds *= float(errors.ratio[errors.row(answer.error_psi)]) ** new
+        return max(odds / (1.0 + odds), _LEAST_WRONG)
 
     def _count(self, solution: Solution, side_deg: float, *, triggered: bool) -> None:
         old = self.statistics
@@ -291,13 +309,13 @@ class RsiIdentifier(SingleCameraIdentifier):
         return field, None if features is None else search.answer_in_region(features, centre, side_deg)
 
     def _accepted(
-        self, measured: CheckedDetections, field: FieldStars, answer: FeatureAnswer
+        self, measured: CheckedDetections, known: Preprocessed, field: FieldStars, answer: FeatureAnswer
     ) -> Solution | None:
         """The solution of the region's answer; None if ε_ψ > τ, or refinement does not verify it."""
         if answer.error_psi > self.options.tau:
             return None
         if not self.options.refinement:
-            found = self.lsi.by_features_alone(answer, self._region_errors)
+            found = self.lsi.by_features_alone(answer, self._place_wrong(answer, known))
             return dataclasses.replace(found, mode="tracking", features=report_of(answer, "rsi"))
         for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
             if attitude is None:
