@@ -9,6 +9,7 @@ default or 0. The function of a numbered quantity, such as `stars[n].x`, also ta
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final, TypeAlias, TypeVar
@@ -31,6 +32,7 @@ from starhil.protocol.image_transfer import (
     parse_burst_packet,
 )
 from starhil.protocol.messages import ErrorCode
+from starid.identification.solution import FeatureReport
 
 Getter: TypeAlias = Callable[[Snapshot], Value | None]
 Kind = TypeVar("Kind", bool, int, float, str, bytes)
@@ -123,6 +125,18 @@ def _solution(
 
     _quantity(name, float, unit, doc + "; 0 if invalid.", of_solution)
     return of_solution
+
+
+def _features(
+    name: str, kind: type[Kind], unit: str, doc: str, function: Callable[[FeatureReport], Kind]
+) -> None:
+    """Declare a quantity of the features of the last frame, which has no value for the algorithm `geometric`."""
+
+    def of_features(shot: Snapshot) -> Kind | None:
+        known = None if shot.frame is None else shot.frame.result.features
+        return None if known is None else function(known)
+
+    _quantity(f"features.{name}", kind, unit, doc, of_features)
 
 
 def _star(
@@ -264,6 +278,28 @@ _frame("frame.index_pending", bool, "", "Whether the frame was solved with the s
 _frame("frame.background", float, "DN", "Mean level of the background.",
        lambda frame: float(frame.result.background_dn))
 _frame("frame.noise", float, "DN", "Noise of the background.", lambda frame: float(frame.result.noise_dn))
+
+# --- features: how an algorithm of the thesis worked ---
+
+_features("available", bool, "", "Whether the last frame was identified by features (`run.algorithm` lsi or rsi).",
+          lambda known: known.observed is not None)
+_features("region_searched", bool, "", "Whether the answer is from the region of search, not from the whole database.",
+          lambda known: known.search == "rsi")
+_features("triggered", bool, "", "Whether the region's answer was not good enough, so that the whole database was searched.",
+          lambda known: known.triggered)
+_features("refined", bool, "", "Whether the attitude was refined and verified with matched stars.", lambda known: known.refined)
+_features("error_psi", float, "", "Error of the reconstructed features, normalised units; 0 with too few stars.",
+          lambda known: 0.0 if math.isnan(known.error_psi) else known.error_psi)
+_features("cell", int, "", "Cell of the nearest neighbour, numbered from 1 as in the thesis; 0 with too few stars.",
+          lambda known: known.cell + 1)
+_features("weights", int, "", "Number of cells of the dictionary with a weight.", lambda known: known.weights)
+_features("region", float, "deg", "Side of the region of search; 0 if there was none.", lambda known: known.region_deg)
+_features("stars", int, "", "Detections that the false-star filter kept.", lambda known: known.stars)
+_features("removed", int, "", "Detections that the false-star filter removed.", lambda known: known.removed)
+_features("rotation", float, "deg", "Measured rotation of the image since the last one, about the boresight; 0 if unknown.",
+          lambda known: known.rotation_deg)
+_features("translation", float, "deg", "Measured shift of the image since the last one; 0 if unknown.",
+          lambda known: known.translation_deg)
 
 # --- stars ---
 

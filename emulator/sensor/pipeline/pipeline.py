@@ -8,6 +8,7 @@ import math
 import subprocess
 import time
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -35,6 +36,7 @@ from starhil.emulator.sensor.pipeline.messages import (
     as_triple,
     camera_constants,
 )
+from starhil.emulator.sensor.pipeline.photometry import MeasuredPhotometry, measure_photometry
 from starhil.emulator.sensor.pipeline.precompile import start_helper
 from starhil.emulator.sensor.pipeline.preview import make_preview
 from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
@@ -270,13 +272,14 @@ class Pipeline:
                 window_px=float(min(settings.tracking_margin, *windows_px)),
                 observer_velocity=request.observer_velocity,
             )
-        if not solution.valid:
+        if not solution.valid or (solution.features is not None and not solution.features.refined):
             return solution
         if _within_margin(identifier, solution, xy, request) < settings.min_stars_matched:
             reason = (
                 Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
             )
-            return Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
+            rejected = Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
+            return replace(rejected, features=solution.features)
         if self._calibration is None:
             return solution
         camera, used = calibrated_camera(self.camera, settings), solution.detection_index
@@ -290,11 +293,28 @@ class Pipeline:
         options.setdefault("limiting_magnitude", settings.limiting_magnitude)
         if setup.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
             options.setdefault("zero_point", 2.5 * math.log10(self._sensor.zero_magnitude_e_s))
+            options.setdefault("colour_term", self._sensor.colour_term)
+            if "detected_limit" not in options:
+                found = self._measured_photometry
+                options |= {"detected_limit": found.limit} | {"magnitude_sigma": found.sigma, **options}
         camera = calibrated_camera(self.camera, settings)
         margin = settings.error_margin / 100.0
         return StarIdentifierSetup(
             setup.algorithm, camera, margin, tuple(sorted(options.items())), request.upsets
         )
+
+    @cached_property
+    def _measured_photometry(self) -> MeasuredPhotometry:
+        """The limit of the detector with the exposure of the profile."""
+        exposure_s = self._setup.exposure_s
+        known = self._sensor.with_(exposure_s=exposure_s).detection_settings()
+        settings = detection_settings(known, SolverSettings())
+
+        def expose(attitude: Attitude, index: int) -> Frame:
+            return self._renderer.render(attitude, ZERO_RATE, index, exposure_s=exposure_s)
+
+        zero_e = self._sensor.zero_magnitude_e_s * exposure_s
+        return measure_photometry(expose, lambda frame: detect(frame.image, settings), zero_e)
 
     def _frame_result(
         self,
@@ -343,7 +363,8 @@ class Pipeline:
             matched=solution.star_count,
             stars=tuple(stars[:STARS_SENT]),
             probability_false=solution.probability_false if valid else 1.0,
-            rms_px=solution.rms_px if valid else 0.0,
+            rms_px=solution.rms_px if valid and solution.star_count else 0.0,
+            features=solution.features,
             background_dn=float(found.background),
             noise_dn=float(found.noise),
             render_s=rendered - begin,

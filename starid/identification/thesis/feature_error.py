@@ -118,7 +118,8 @@ class FeatureErrors:
         count = np.bincount(rows, minlength=_CLASSES)
         wrong = (np.bincount(rows[lost], minlength=_CLASSES) + 0.5) / (count + 1.0)
         likely, unlikely = (
-            (np.bincount(np.searchsorted(upper, found), minlength=_CLASSES) + 0.5) / (len(found) + 0.5 * _CLASSES)
+            (np.bincount(np.searchsorted(upper, found), minlength=_CLASSES) + 0.5)
+            / (len(found) + 0.5 * _CLASSES)
             for found in (here, elsewhere)
         )
         return cls(upper, wrong, right, _mean_squares(squares[lost]), unlikely / likely)

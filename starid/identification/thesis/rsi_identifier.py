@@ -25,7 +25,13 @@ from starid.identification.solution import FeatureReport, Solution
 from starid.identification.thesis.cme import matched_motion
 from starid.identification.thesis.false_stars import ObservedFrame
 from starid.identification.thesis.feature_search import ESTIMATE_SHARE, FeatureAnswer, FieldStars
-from starid.identification.thesis.lsi_identifier import REGION_DEG, WINDOW_PX, LsiIdentifier, LsiOptions, report_of
+from starid.identification.thesis.lsi_identifier import (
+    REGION_DEG,
+    WINDOW_PX,
+    LsiIdentifier,
+    LsiOptions,
+    report_of,
+)
 from starid.identification.thesis.rsi import RsiSettings, region_side
 from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings, rays
 

@@ -346,8 +346,7 @@ class _Motions(Protocol):
     still: Array
 
     def start(self, last: Array) -> tuple[Array, Array]:
-        """From the last motion: one by which to move the objects before the rest is searched for, and a guess of the rest
-        near the centre, (4,)."""
+        """From the last motion: one by which to move the objects first, and a guess of the rest near the centre, (4,)."""
         ...
 
     def of_plane(self, motion: Array) -> Array:
