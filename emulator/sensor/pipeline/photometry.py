@@ -29,6 +29,7 @@ _FIRST_INDEX: Final = 1 << 40
 _SEED: Final = 24
 _BIN_MAG: Final = 0.25
 _MATCH_PX: Final = 3.0
+_BLEND_PX: Final = 6.0
 _EDGE_PX: Final = 5.0
 _FEWEST: Final = 20
 _MAD_TO_SIGMA: Final = 1.4826
@@ -68,6 +69,11 @@ def _compared(frame: Frame, found: Detections, zero_e: float) -> tuple[Array, Ar
     inside = frame.stars.visible & (frame.stars.electrons > 0.0)
     inside &= (np.minimum(xy, np.array([width - 1, height - 1]) - xy) > _EDGE_PX).all(axis=1)
     xy, true = xy[inside], -2.5 * np.log10(frame.stars.electrons[inside] / zero_e)
+    order = np.argsort(true, kind="stable")
+    xy, true = xy[order], true[order]
+    apart = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
+    alone = ~(np.tril(apart < _BLEND_PX, -1)).any(axis=1)  # no brighter star of which it would be a part
+    xy, true = xy[alone], true[alone]
     error = np.full(true.size, np.nan)
     if len(found.flux) and len(xy):
         distance = np.hypot(*(xy[:, None] - found.xy_px[None]).transpose(2, 0, 1))
@@ -85,7 +91,6 @@ def _limit_of(magnitude: Array, error: Array) -> MeasuredPhotometry:
     for low in edges:
         of_class = (magnitude >= low) & (magnitude < low + _BIN_MAG)
         if np.count_nonzero(of_class) < _FEWEST:
-            limit = max(limit, float(low)) if np.count_nonzero(magnitude < low) < _FEWEST else limit
             continue
         seen = error[of_class & np.isfinite(error)]
         share = seen.size / np.count_nonzero(of_class)

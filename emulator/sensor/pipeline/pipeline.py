@@ -187,11 +187,7 @@ class Pipeline:
         if not request.solve:
             preview = self._preview(exposure, sensor) if request.preview else None
             return FrameResult(request.index, solved=False, render_s=rendered - begin, preview=preview)
-        if self.images is None:
-            image, known = self._without_dark(exposure.image, request), sensor.detection_settings()
-        else:
-            image, known = exposure.image, DetectionSettings()
-        found = detect(image, detection_settings(known, request.settings))
+        found = self._detect(exposure, request, sensor)
         detected = time.perf_counter()
         identifier, current = self._identifiers.get(self._identifier_setup(request))
         solution = self._solve(identifier, found, request)
@@ -207,6 +203,26 @@ class Pipeline:
         if request.preview:
             result = replace(result, preview=self._preview(exposure, sensor, found, solution))
         return result if current else replace(result, index_pending=True)
+
+    def detections(self, request: FrameRequest) -> Detections:
+        """Take the image of a request and return its detections."""
+        sensor = self._sensor.with_(exposure_s=request.exposure_s, gain=request.gain)
+        return self._detect(self._expose(request), request, sensor)
+
+    def identifier(self, request: FrameRequest) -> StarIdentifier:
+        """Return the star identifier for the parameters of a request."""
+        return self._identifiers.build(self._identifier_setup(request))
+
+    def solution(self, found: Detections, request: FrameRequest) -> Solution:
+        """Identify detections with the parameters of a request."""
+        return self._solve(self.identifier(request), found, request)
+
+    def _detect(self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel) -> Detections:
+        if self.images is None:
+            image, known = self._without_dark(exposure.image, request), sensor.detection_settings()
+        else:
+            image, known = exposure.image, DetectionSettings()
+        return detect(image, detection_settings(known, request.settings))
 
     def _preview(
         self,

@@ -36,6 +36,8 @@ from starid.identification.thesis.rsi import RsiSettings, region_side
 from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings, rays
 
 _MIN_MATCHES: Final = 3
+_ENOUGH_MATCHES: Final = 8
+"""Number of matches that two images of different fields do not have by chance."""
 _LEAST_WRONG: Final = 1e-4
 
 
@@ -281,7 +283,8 @@ class RsiIdentifier(SingleCameraIdentifier):
         if before is None:
             return unknown
         result = self._filter(before, frame)
-        if result.matches.shape[0] < _MIN_MATCHES:
+        needed = min(_ENOUGH_MATCHES, 0.5 * min(len(before), len(frame)))
+        if result.matches.shape[0] < max(_MIN_MATCHES, needed):
             return unknown
         motion = matched_motion(before, frame, result.matches)
         if motion is None:
