@@ -36,6 +36,7 @@ _ALGORITHM_COLUMNS: Final[tuple[Column, ...]] = (
     ("frames", lambda row: str(row["frames"])),
     ("valid %", _number("valid_pct", 1)),
     ("wrong", lambda row: str(row["wrong"])),
+    ("within .3 %", _number("within_pct", 1)),
     ("across deg", _number("across_deg", 4)),
     ("about deg", _number("about_deg", 4)),
     ("chi2", _number("normalised_squared_error", 2)),

@@ -61,6 +61,8 @@ WINDOW_PX: Final = 12.0
 SOLAR_COLOUR_B_V: Final = 0.65
 """B−V of a star for which the colour term is zero; also taken for stars of unknown colour."""
 
+_TAU_REFINED: Final = 1.0
+_TAU_ALONE: Final = 0.5
 _DEFAULT_SIGMA_MAG: Final = 0.1
 _DEEPER_MAG: Final = 0.5
 _ZERO_POINT_STEPS: Final = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5)
@@ -101,14 +103,19 @@ class LsiOptions:
     refinement
         Refine and verify the attitude with matched stars. Otherwise it is that of the features alone, to about a degree
         and with the uncertainty of simulated fields (`starid.identification.thesis.feature_error`).
-    tau, invalid_factor
-        Threshold τ on ε_ψ, and factor K: the features of an image with ε_ψ > K·τ give no attitude.
+    tau
+        Threshold τ on ε_ψ, beyond which the answer from a region of search is not good enough. By default the two of
+        the thesis: 1 with refinement, which verifies what it lets pass, and 0.5 without.
+    invalid_factor
+        Factor K: features with ε_ψ > K·τ give no attitude.
     feature_limit
         Brightness limit κ: faintest magnitude of the stars in the features; default: for ten stars per field, but
         not fainter than `detected_limit`.
-    detected_limit, magnitude_sigma
-        Magnitude at which the sensor finds 90 % of the stars, and the error of a magnitude there. The device
-        measures them; without them every star in the brightness limit is assumed to be found.
+    detected_limit
+        Magnitude at which the sensor finds 90 % of the stars; a device measures it on its own images. By default all
+        stars within the brightness limit are found.
+    magnitude_sigma
+        One-sigma error of a magnitude at that limit; a device measures it too.
     colour_term
         The sensor's magnitude is V − colour_term·(B−V − 0.65).
     overlap
@@ -132,7 +139,7 @@ class LsiOptions:
     """
 
     refinement: bool = True
-    tau: float = 0.5
+    tau: float | None = None
     invalid_factor: float = 10.0
     feature_limit: float | None = None
     detected_limit: float | None = None
@@ -150,7 +157,7 @@ class LsiOptions:
     def __post_init__(self) -> None:
         if self.neighbours < 1:
             raise StaridError(f"lsi neighbours: must be at least 1, not {self.neighbours}")
-        if not (self.tau > 0.0 and self.invalid_factor > 0.0):
+        if not (self.threshold > 0.0 and self.invalid_factor > 0.0):
             raise StaridError(
                 f"lsi tau, invalid_factor: must be positive, not {self.tau}, {self.invalid_factor}"
             )
@@ -158,6 +165,18 @@ class LsiOptions:
             raise StaridError(
                 "lsi divided: needs refinement = true, because only matched stars tell which circle is right"
             )
+
+    @property
+    def threshold(self) -> float:
+        """The threshold τ on ε_ψ, as given or the default."""
+        if self.tau is not None:
+            return self.tau
+        return _TAU_REFINED if self.refinement else _TAU_ALONE
+
+    @property
+    def largest_error_psi(self) -> float:
+        """The largest ε_ψ of features that give an attitude, K·τ."""
+        return self.invalid_factor * self.threshold
 
 
 class LsiIdentifier(VerifiedIdentifier):
@@ -381,7 +400,7 @@ class LsiIdentifier(VerifiedIdentifier):
         """
         report = report_of(answer, "lsi")
         psi = answer.error_psi
-        if self.errors is None or psi > self.options.invalid_factor * self.options.tau:
+        if self.errors is None or psi > self.options.largest_error_psi:
             return dataclasses.replace(Solution.invalid(Reason.RESIDUAL), features=report)
         likely = float(self.errors.wrong[self.errors.row(psi)]) if wrong is None else wrong
         return Solution(
@@ -416,11 +435,7 @@ class LsiIdentifier(VerifiedIdentifier):
                 answer = search.answer(features)
                 coarse = coarse or answer
                 answers = sorted((*first, answer), key=lambda each: each.error_psi)
-            usable = [
-                each.place
-                for each in answers
-                if each.error_psi <= self.options.invalid_factor * self.options.tau
-            ]
+            usable = [each.place for each in answers if each.error_psi <= self.options.largest_error_psi]
             candidates = itertools.chain(
                 *(search.attitudes(field, place, ESTIMATE_SHARE) for place in usable),
                 search.attitudes_of(field, observations),

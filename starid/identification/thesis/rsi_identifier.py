@@ -150,7 +150,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         super().__init__(camera, self.lsi.catalog)
         self.options = options
         self._settings = RsiSettings(
-            tau=options.tau,
+            tau=options.threshold,
             invalid_factor=options.invalid_factor,
             gamma_min_deg=options.gamma_min_deg,
             gamma_scale=options.gamma_scale,
@@ -229,11 +229,11 @@ class RsiIdentifier(SingleCameraIdentifier):
             if window_px is not None:
                 side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
         side = min(side, self.lsi.database.parameters.fov_deg)
-        field, answer = self._in_region(measured, known, centre, side)
-        solution = None if field is None or answer is None else self._accepted(measured, known, field, answer)
+        field, answers = self._in_region(measured, known, centre, side)
+        solution = None if field is None else self._accepted(measured, known, field, answers)
         triggered = solution is None
         if solution is None:
-            solution = self._whole_sky(measured, known, () if answer is None else (answer,))
+            solution = self._whole_sky(measured, known, answers[:1])
         self._count(solution, side, triggered=triggered)
         self._remember(solution)
         report = known.add_to(solution.features, triggered=triggered, region_deg=side)
@@ -308,32 +308,49 @@ class RsiIdentifier(SingleCameraIdentifier):
 
     def _in_region(
         self, measured: CheckedDetections, known: Preprocessed, centre: Attitude, side_deg: float
-    ) -> tuple[FieldStars | None, FeatureAnswer | None]:
-        """The field's stars, and the answer of the nearest cell of the region; None for what there is not."""
+    ) -> tuple[FieldStars | None, tuple[FeatureAnswer, ...]]:
+        """The field's stars, and the answers of the cells of the region that are nearest to its features.
+
+        The first answer is that of the features as seen. With refinement, those of features with a star or two fewer or more
+        follow, the smallest ε_ψ first.
+        """
         search, zero_point = self.lsi.search, self.lsi.zero_point
         if zero_point is None:
-            return None, None
+            return None, ()
         field = search.field_stars(measured.xy, measured.flux, zero_point).only(known.true_stars)
-        features = search.features(field)
-        return field, None if features is None else search.answer_in_region(features, centre, side_deg)
+        seen = search.features(field)
+        if seen is None:
+            return field, ()
+        observations = search.doubtful_features(field) if self.options.refinement else [seen]
+        found = [search.answer_in_region(features, centre, side_deg) for features in observations]
+        answers = [answer for answer in found if answer is not None]
+        return field, (*answers[:1], *sorted(answers[1:], key=lambda answer: answer.error_psi))
 
     def _accepted(
-        self, measured: CheckedDetections, known: Preprocessed, field: FieldStars, answer: FeatureAnswer
+        self,
+        measured: CheckedDetections,
+        known: Preprocessed,
+        field: FieldStars,
+        answers: tuple[FeatureAnswer, ...],
     ) -> Solution | None:
-        """The solution of the region's answer; None if ε_ψ > τ, or refinement does not verify it."""
-        if answer.error_psi > self.options.tau:
-            return None
-        if not self.options.refinement:
-            found = self.lsi.by_features_alone(answer, self._place_wrong(answer, known))
-            return dataclasses.replace(found, mode="tracking", features=report_of(answer, "rsi"))
-        for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
-            if attitude is None:
+        """The solution of the first answer of the region that is good enough; None if there is none.
+
+        It is good enough if ε_ψ ≤ τ and, with refinement, if it is verified.
+        """
+        for answer in answers:
+            if answer.error_psi > self._settings.tau:
                 continue
-            solution = self.lsi.verify(measured, attitude, WINDOW_PX)
-            if solution.valid:
-                self.lsi.learn(solution, measured.flux)
-                report = report_of(answer, "rsi", refined=True)
-                return dataclasses.replace(solution, mode="tracking", features=report)
+            if not self.options.refinement:
+                found = self.lsi.by_features_alone(answer, self._place_wrong(answer, known))
+                return dataclasses.replace(found, mode="tracking", features=report_of(answer, "rsi"))
+            for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
+                if attitude is None:
+                    continue
+                solution = self.lsi.verify(measured, attitude, WINDOW_PX)
+                if solution.valid:
+                    self.lsi.learn(solution, measured.flux)
+                    report = report_of(answer, "rsi", refined=True)
+                    return dataclasses.replace(solution, mode="tracking", features=report)
         return None
 
 
