@@ -83,7 +83,7 @@ def test_five_missing_stars_of_the_brightest_need_no_divided_field():
         if solution.valid:
             valid += 1
             assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
-    assert valid >= 19
+    assert valid >= 17
 
 
 @pytest.mark.parametrize(("ra", "dec"), [(0.0, 90.0), (123.0, -90.0), (0.01, 0.0), (359.99, 45.0)])
