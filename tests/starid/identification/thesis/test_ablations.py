@@ -18,7 +18,7 @@ from starid.identification.thesis.rsi_identifier import RsiIdentifier
 ZERO_POINT = 20.3
 LIMIT = 6.0
 SENSOR = {"zero_point": ZERO_POINT, "detected_limit": LIMIT, "magnitude_sigma": 0.03}
-FRAMES = 40
+FRAMES = 30
 RIGHT_DEG = 1.5
 WRONG_DEG = 0.1
 
@@ -164,7 +164,7 @@ def test_a_reversed_motion_loses_the_region(monkeypatch):
 def test_the_features_alone_state_the_error_that_they_have(algorithm):
     rng, features_only = np.random.default_rng(43), identifier(algorithm, False)  # noqa: FBT003
     squares = []
-    for _ in range(150):
+    for _ in range(90):
         attitude = random_attitude(rng)
         features_only.reset()
         solution = features_only.identify(*image(rng, attitude))
@@ -173,5 +173,5 @@ def test_the_features_alone_state_the_error_that_they_have(algorithm):
             squares.append(float(np.mean(error**2 / np.diag(solution.covariance))))
             assert solution.cross_boresight_sigma_arcsec > 600.0
             assert not solution.features.refined
-    assert len(squares) >= 140
+    assert len(squares) >= 80
     assert 0.5 <= np.mean(squares) <= 2.0
