@@ -134,7 +134,7 @@ def _without(found: Detections, missing: int, rng: np.random.Generator) -> Detec
     brightest = np.argsort(-found.flux)[:25]
     lost = rng.choice(brightest, size=min(missing, brightest.size), replace=False)
     kept = np.delete(np.arange(found.flux.size), lost)
-    columns = {
+    columns: dict[str, Any] = {
         name: value[kept]
         for name, value in vars(found).items()
         if isinstance(value, np.ndarray) and value.shape[:1] == found.flux.shape

@@ -94,7 +94,9 @@ class FeatureErrors:
     def of_search(cls, search: FeatureSearch, photometry: Photometry, side_deg: float) -> Self:
         """Measure the errors on simulated fields, in the whole database and in regions of a side in degrees."""
         rng = np.random.default_rng(_SEED)
-        psi, errors, here, elsewhere = [], [], [], []
+        psi, errors = [], []
+        here: list[float] = []
+        elsewhere: list[float] = []
         for _ in range(FIELDS):
             truth, other = random_attitude(rng), random_attitude(rng)
             truth = Attitude.from_radec_roll(truth.ra_deg, truth.dec_deg, 0.0)

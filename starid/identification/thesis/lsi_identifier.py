@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starid.arrays import Array
+from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
@@ -352,7 +352,7 @@ class LsiIdentifier(VerifiedIdentifier):
         measured: CheckedDetections,
         zero_points: Sequence[float],
         first: Sequence[FeatureAnswer] = (),
-        kept: Array | None = None,
+        kept: Mask | None = None,
     ) -> Solution:
         """Search the whole database: stage one, and with refinement stage two.
 
@@ -369,7 +369,7 @@ class LsiIdentifier(VerifiedIdentifier):
         return solution
 
     def _fields(
-        self, measured: CheckedDetections, search: FeatureSearch, zero_point: float, kept: Array | None
+        self, measured: CheckedDetections, search: FeatureSearch, zero_point: float, kept: Mask | None
     ) -> FieldStars:
         field = search.field_stars(measured.xy, measured.flux, zero_point)
         return field if kept is None else field.only(kept)
@@ -379,7 +379,7 @@ class LsiIdentifier(VerifiedIdentifier):
         measured: CheckedDetections,
         zero_points: Sequence[float],
         first: Sequence[FeatureAnswer],
-        kept: Array | None,
+        kept: Mask | None,
     ) -> Solution:
         """The attitude of the features alone, at the first zero point for which there are any."""
         for zero_point in zero_points:
@@ -417,7 +417,7 @@ class LsiIdentifier(VerifiedIdentifier):
         measured: CheckedDetections,
         zero_points: Sequence[float],
         first: Sequence[FeatureAnswer],
-        kept: Array | None,
+        kept: Mask | None,
     ) -> Solution:
         """Try the zero points in order, each in the whole field and then in the circles; return the first verified answer."""
         tried = verified = 0

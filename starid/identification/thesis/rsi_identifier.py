@@ -254,7 +254,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         new = min(known.translation_deg / self.lsi.database.grid.step_deg, 1.0)
         odds = self._wrong / max(1.0 - self._wrong, _LEAST_WRONG)
         odds *= float(errors.ratio[errors.row(answer.error_psi)]) ** new
-        return max(odds / (1.0 + odds), _LEAST_WRONG)
+        return max(float(odds / (1.0 + odds)), _LEAST_WRONG)
 
     def _count(self, solution: Solution, side_deg: float, *, triggered: bool) -> None:
         old = self.statistics
