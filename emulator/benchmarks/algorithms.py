@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
+from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.pipeline.messages import FrameRequest
 from starhil.emulator.truth.source import TruthState
 from starid.attitude import Attitude, propagate, random_attitude, rate_between
@@ -39,7 +40,7 @@ PERIOD_S: Final = 1.0
 ALGORITHMS: Final[dict[str, tuple[str, ...]]] = {
     "geometric": ("run.algorithm=geometric",),
     "thesis": ("run.algorithm=rsi", "identifier.refinement=false"),
-    "thesis + refinement": ("run.algorithm=rsi",),
+    "thesis + refinement": ("run.algorithm=rsi", "identifier.refinement=true"),
 }
 """Name → settings of the profile."""
 
@@ -79,9 +80,13 @@ class Comparison:
 
     def __init__(self, plan: AlgorithmPlan) -> None:
         self.plan = plan
+        own = load_profile(plan.profile, plan.overrides)
+        # a profile with options of the thesis's algorithms has none for the geometric one
+        skipped = "geometric" if own.run.algorithm != "geometric" and own.identifier else None
         self.devices = {
             name: EcssDevice(EcssPlan(plan.profile, (*plan.overrides, *settings), plan.seed))
             for name, settings in ALGORITHMS.items()
+            if name != skipped
         }
 
     def rows(self, scene: Scene) -> Iterator[dict[str, Any]]:
@@ -100,7 +105,7 @@ class Comparison:
 
     def _images(self, scene: Scene) -> Iterator[tuple[FrameRequest, Detections, bool]]:
         """Requests without a prediction, their detections, and whether a new sequence starts."""
-        device = self.devices["geometric"]
+        device = next(iter(self.devices.values()))
         length = 1 if scene.rate_deg_s == 0.0 else SEQUENCE
         attitude, rate = Attitude.identity(), np.zeros(3)
         for number in range(self.plan.frames):
