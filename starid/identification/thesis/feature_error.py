@@ -16,6 +16,7 @@ import numpy as np
 from starid.arrays import Array
 from starid.attitude import Attitude, random_attitude
 from starid.identification.thesis.feature_search import FeatureSearch
+from starid.identification.thesis.features import FeatureVector
 
 FIELDS: Final = 800
 """Number of simulated fields."""
@@ -72,7 +73,8 @@ class FeatureErrors:
     gross
         The same for those at another place, (2,).
     ratio
-        How much more often a region at another place has such an ε_ψ than the region of the true place, (k,).
+        How much more often the region around an answer at another place has such an ε_ψ, after a motion by about a cell,
+        than the region around an answer at the right place, (k,).
     """
 
     upper: Array
@@ -98,19 +100,25 @@ class FeatureErrors:
         here: list[float] = []
         elsewhere: list[float] = []
         for _ in range(FIELDS):
-            truth, other = random_attitude(rng), random_attitude(rng)
-            truth = Attitude.from_radec_roll(truth.ra_deg, truth.dec_deg, 0.0)
-            brightness, offsets, _ = search.stars.stars_in_frame(truth.ra_deg, truth.dec_deg)
-            features = search.features(search.field_of(offsets, photometry.measured(rng, brightness)))
+            somewhere = random_attitude(rng)
+            truth = Attitude.from_radec_roll(somewhere.ra_deg, somewhere.dec_deg, 0.0)
+            features = _features_at(search, photometry, rng, truth)
             if features is None:
                 continue
             answer = search.answer(features)
             psi.append(answer.error_psi)
             errors.append(answer.attitude.error_to(truth).rotation_vector_rad)
-            for centre, found in ((truth, here), (other, elsewhere)):
-                local = search.answer_in_region(features, centre, side_deg)
-                if local is not None:
-                    found.append(local.error_psi)
+            step = search.database.grid.step_deg * rng.normal(size=2)
+            move = (*np.radians(step), 0.0)
+            later = _features_at(search, photometry, rng, truth.rotated(move))
+            local = (
+                None
+                if later is None
+                else search.answer_in_region(later, answer.attitude.rotated(move), side_deg)
+            )
+            if local is not None:
+                found = elsewhere if math.hypot(*errors[-1][:2]) > math.radians(RIGHT_DEG) else here
+                found.append(local.error_psi)
         squares = np.array(errors) ** 2
         upper = np.quantile(psi, np.arange(1, _CLASSES + 1) / _CLASSES)
         upper[-1] = math.inf
@@ -125,6 +133,14 @@ class FeatureErrors:
             for found in (here, elsewhere)
         )
         return cls(upper, wrong, right, _mean_squares(squares[lost]), unlikely / likely)
+
+
+def _features_at(
+    search: FeatureSearch, photometry: Photometry, rng: np.random.Generator, attitude: Attitude
+) -> FeatureVector | None:
+    """Features of the field at an attitude as the detector sees it; None with too few stars."""
+    brightness, offsets, _ = search.stars.stars_in_frame(attitude.ra_deg, attitude.dec_deg)
+    return search.features(search.field_of(offsets, photometry.measured(rng, brightness)))
 
 
 def _mean_squares(squares: Array) -> Array:
