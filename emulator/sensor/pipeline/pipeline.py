@@ -323,7 +323,7 @@ class Pipeline:
         """The limit of the detector with the exposure of the profile."""
         exposure_s = self._setup.exposure_s
         known = self._sensor.with_(exposure_s=exposure_s).detection_settings()
-        settings = detection_settings(known, SolverSettings())
+        settings = detection_settings(known, self._setup.settings)
 
         def expose(attitude: Attitude, index: int) -> Frame:
             return self._renderer.render(attitude, ZERO_RATE, index, exposure_s=exposure_s)
