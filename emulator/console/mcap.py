@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import dataclasses
 import functools
 import importlib.metadata
 import io
 import json
 import logging
+import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -76,6 +78,7 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
         name: _NUMBER | ({"unit": UNITS[name]} if name in UNITS else {}) for name in COLUMNS
     }
     | {"mode": _TEXT, "reason": _TEXT, "valid": {"type": "boolean"}},
+    "starhil.Features": {},
     "starhil.Faults": {},
     "starhil.Traffic": {"out": {"type": "boolean"}, "raw": _TEXT, "kind": _TEXT, "text": _TEXT},
 }
@@ -182,6 +185,11 @@ class McapRecorder:
         values: dict[str, Any] = {**known, "valid": measurement.valid, "reason": measurement.reason}
         values["mode"] = MODES[int(row["mode"] or 0)]
         self._write("/measurement", "starhil.Measurement", at_ns, values)
+        if measurement.result.features is not None:
+            features = dataclasses.asdict(measurement.result.features)
+            if math.isnan(features["error_psi"]):
+                del features["error_psi"]
+            self._write("/features", "starhil.Features", at_ns, features)
 
     def _metadata(self) -> dict[str, str]:
         """Return what identifies the run."""

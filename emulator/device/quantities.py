@@ -6,6 +6,7 @@ default or 0. The function of a numbered quantity, such as `stars[n].x`, also ta
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Final, TypeAlias
 
@@ -27,6 +28,7 @@ from starhil.protocol.image_transfer import (
     parse_burst_packet,
 )
 from starhil.protocol.messages import ErrorCode
+from starid.identification.solution import FeatureReport
 
 Getter: TypeAlias = Callable[[Snapshot], Value | None]
 
@@ -90,6 +92,16 @@ def _solution(name: str, function: Callable[[Measurement], float]) -> Callable[[
 
     _quantity(name, of_solution)
     return of_solution
+
+
+def _features(name: str, function: Callable[[FeatureReport], Value]) -> None:
+    """Bind a quantity of the features of the last frame, which has no value for the algorithm `geometric`."""
+
+    def of_features(shot: Snapshot) -> Value | None:
+        known = None if shot.frame is None else shot.frame.result.features
+        return None if known is None else function(known)
+
+    _quantity(f"features.{name}", of_features)
 
 
 def _star(name: str, function: Callable[[Snapshot, MatchedStar], Value | None]) -> None:
@@ -215,6 +227,21 @@ _frame("frame.late", lambda frame: bool(frame.late or frame.reason == "timeout")
 _frame("frame.index_pending", lambda frame: bool(frame.result.index_pending))
 _frame("frame.background", lambda frame: float(frame.result.background_dn))
 _frame("frame.noise", lambda frame: float(frame.result.noise_dn))
+
+# --- features: how an algorithm of the thesis worked ---
+
+_features("available", lambda known: known.observed is not None)
+_features("region_searched", lambda known: known.search == "rsi")
+_features("triggered", lambda known: known.triggered)
+_features("refined", lambda known: known.refined)
+_features("error_psi", lambda known: 0.0 if math.isnan(known.error_psi) else known.error_psi)
+_features("cell", lambda known: known.cell + 1)
+_features("weights", lambda known: known.weights)
+_features("region", lambda known: known.region_deg)
+_features("stars", lambda known: known.stars)
+_features("removed", lambda known: known.removed)
+_features("rotation", lambda known: known.rotation_deg)
+_features("translation", lambda known: known.translation_deg)
 
 # --- stars ---
 

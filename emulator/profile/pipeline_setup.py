@@ -46,5 +46,6 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
         previews=previews,
         dark_frames=profile.device.dark_frames,
         calibration=profile.calibration.matrix(),
+        exposure_s=float(profile.parameters.get("exposure", 200)) / 1000.0,
         images=profile.images.resolved(profile.folder),
     )

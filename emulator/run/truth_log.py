@@ -23,11 +23,14 @@ COLUMNS: Final = (
     "measured_qx", "measured_qy", "measured_qz", "measured_qw", "measured_wx_deg_s", "measured_wy_deg_s", "measured_wz_deg_s",
     "cross_boresight_arcsec", "roll_arcsec", "total_arcsec", "sigma_cross_arcsec", "sigma_roll_arcsec",
     "stars_detected", "stars_matched", "rms_px", "latency_ms", "processing_ms", "render_ms", "detect_ms", "identify_ms", "late",
+    "search", "triggered", "error_psi", "cell", "weights", "region_deg", "stars_used", "stars_removed", "motion_rotation_deg",
+    "motion_translation_deg", "refined",
 )  # fmt: skip
 """Columns: device time as Unix time, quaternions ICRS→sensor scalar last, errors of the measured attitude.
 
 `latency_ms` is simulation time from mid-exposure to publication. `processing_ms` and the next three columns
-are wall times; they are empty on the stepped clock, so that the same run gives the same file.
+are wall times; they are empty on the stepped clock, so that the same run gives the same file. The columns from
+`search` on are those of `starid.identification.solution.FeatureReport`; they are empty for `geometric`.
 """
 
 WALL_TIMES: Final = ("processing_ms", "render_ms", "detect_ms", "identify_ms")
@@ -108,6 +111,21 @@ def compare(measurement: Measurement) -> dict[str, Any]:
             "sigma_cross_arcsec": result.sigma_cross_arcsec,
             "sigma_roll_arcsec": result.sigma_roll_arcsec,
             "rms_px": result.rms_px,
+        }
+    if result.features is not None:
+        known = result.features
+        row |= {
+            "search": known.search,
+            "triggered": known.triggered,
+            "error_psi": None if math.isnan(known.error_psi) else known.error_psi,
+            "cell": known.cell,
+            "weights": known.weights,
+            "region_deg": known.region_deg,
+            "stars_used": known.stars,
+            "stars_removed": known.removed,
+            "motion_rotation_deg": known.rotation_deg,
+            "motion_translation_deg": known.translation_deg,
+            "refined": known.refined,
         }
     return {name: row.get(name) for name in COLUMNS}
 

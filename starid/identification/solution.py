@@ -17,6 +17,7 @@ from starid.camera import Camera
 from starid.errors import StaridError
 
 Mode = Literal["lost_in_space", "tracking"]
+Five = tuple[float, float, float, float, float]
 
 _NO_INDEX: Final = np.empty(0, dtype=np.int64)
 _NO_HIP: Final = np.empty(0, dtype=np.int32)
@@ -32,6 +33,49 @@ class Reason(StrEnum):
     RESIDUAL = "residual"
     PREDICTION_LOST = "prediction_lost"
     BAD_INPUT = "bad_input"
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureReport:
+    """How an algorithm of the thesis found, or did not find, the attitude of one image.
+
+    Attributes
+    ----------
+    search : {"lsi", "rsi"}
+        Where the answer was found: in the whole database, or in the region of search.
+    triggered : bool
+        The region gave no answer that was good enough, so the whole database was searched (algorithm 3, line 12).
+    error_psi : float
+        Error ε_ψ of the reconstructed features, normalised units; NaN if there were too few stars.
+    cell : int
+        Cell of the nearest neighbour, numbered from 0; −1 if there were too few stars.
+    weights : int
+        Number of cells of the dictionary with a weight other than zero.
+    observed, of_cell : tuple of 5 floats
+        Normalised features of the image and of the cell.
+    region_deg : float
+        Side of the region of search, degrees; 0 if there was none.
+    stars, removed : int
+        Number of detections used, and of those that the false-star filter removed.
+    rotation_deg, translation_deg : float
+        Motion since the previous image: rotation about the boresight, and length of the shift; 0 if unknown.
+    refined : bool
+        The attitude was refined and verified with matched stars; otherwise it is that of the features alone.
+    """
+
+    search: Literal["lsi", "rsi"]
+    triggered: bool = False
+    error_psi: float = math.nan
+    cell: int = -1
+    weights: int = 0
+    observed: Five = (0.0,) * 5
+    of_cell: Five = (0.0,) * 5
+    region_deg: float = 0.0
+    stars: int = 0
+    removed: int = 0
+    rotation_deg: float = 0.0
+    translation_deg: float = 0.0
+    refined: bool = False
 
 
 def _nan(*shape: int) -> Array:
@@ -69,6 +113,8 @@ class Solution:
         The mode in which it was found.
     rate_rad_s : ndarray (3,) or None
         Body rate in the sensor frame, if estimated by a tracker.
+    features : FeatureReport or None
+        How an algorithm of the thesis worked; None for the others.
     camera : Camera or None
         The camera refined with the matched stars, if the field of view was uncertain.
     """
@@ -87,6 +133,7 @@ class Solution:
     mode: Mode = "lost_in_space"
     rate_rad_s: Array | None = None
     camera: Camera | None = None
+    features: FeatureReport | None = None
 
     def __post_init__(self) -> None:
         if self.valid != (self.reason is Reason.OK):

@@ -11,8 +11,9 @@ from tests.process.test_sessions import starhil
 pytestmark = pytest.mark.process
 
 
-def test_a_session_with_the_recursive_algorithm_passes(tmp_path):
-    done = starhil("session", "recursive", "--start", "--can", "auto", "--log", tmp_path, "--json")
+@pytest.mark.parametrize("session", ["recursive", "recursive_features"])
+def test_a_session_with_the_recursive_algorithm_passes(tmp_path, session):
+    done = starhil("session", session, "--start", "--can", "auto", "--log", tmp_path, "--json")
     result = json.loads(done.stdout)
     failed = [(item["step"], item["detail"]) for item in result["results"] if item["status"] == "failed"]
     assert (done.returncode, failed) == (0, [])

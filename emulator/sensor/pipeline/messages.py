@@ -11,6 +11,7 @@ from typing import Any, Final, Self, TypeAlias
 from starhil.emulator.truth.source import TruthState
 from starid.arrays import Array
 from starid.attitude import Attitude
+from starid.identification.solution import FeatureReport
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
 Triple: TypeAlias = tuple[float, float, float]
@@ -101,6 +102,8 @@ class PipelineSetup:
     calibration: list[list[float]] | None = None
     """Covariance (9, 9) of the calibrated camera's parameters, as in `starid.camera.calibration.Calibration`; None: they are
     exact."""
+    exposure_s: float = 0.2
+    """Exposure in which the limit of the detector is measured, for the algorithms that count stars."""
     images: dict[str, Any] = field(default_factory=dict)
     """Source of images instead of rendering: keys of `[images]` in a profile."""
 
@@ -227,6 +230,8 @@ class FrameResult:
     probability_false: float = 1.0
     rms_px: float = 0.0
     """As in `starid.identification.solution.Solution`."""
+    features: FeatureReport | None = None
+    """How an algorithm of the thesis worked; None for `geometric`."""
     index_pending: bool = False
     """Whether the frame was solved with the star index of earlier settings, because a new one is being built."""
     background_dn: float = 0.0

@@ -8,6 +8,7 @@ import math
 import subprocess
 import time
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -35,6 +36,7 @@ from starhil.emulator.sensor.pipeline.messages import (
     as_triple,
     camera_constants,
 )
+from starhil.emulator.sensor.pipeline.photometry import MeasuredPhotometry, measure_photometry
 from starhil.emulator.sensor.pipeline.precompile import start_helper
 from starhil.emulator.sensor.pipeline.preview import make_preview
 from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
@@ -185,11 +187,7 @@ class Pipeline:
         if not request.solve:
             preview = self._preview(exposure, sensor) if request.preview else None
             return FrameResult(request.index, solved=False, render_s=rendered - begin, preview=preview)
-        if self.images is None:
-            image, known = self._without_dark(exposure.image, request), sensor.detection_settings()
-        else:
-            image, known = exposure.image, DetectionSettings()
-        found = detect(image, detection_settings(known, request.settings))
+        found = self._detect(exposure, request, sensor)
         detected = time.perf_counter()
         identifier, current = self._identifiers.get(self._identifier_setup(request))
         solution = self._solve(identifier, found, request)
@@ -204,6 +202,26 @@ class Pipeline:
         if request.preview:
             result = replace(result, preview=self._preview(exposure, sensor, found, solution))
         return result if current else replace(result, index_pending=True)
+
+    def detections(self, request: FrameRequest) -> Detections:
+        """Take the image of a request and return its detections."""
+        sensor = self._sensor.with_(exposure_s=request.exposure_s, gain=request.gain)
+        return self._detect(self._expose(request), request, sensor)
+
+    def identifier(self, request: FrameRequest) -> StarIdentifier:
+        """Return the star identifier for the parameters of a request."""
+        return self._identifiers.build(self._identifier_setup(request))
+
+    def solution(self, found: Detections, request: FrameRequest) -> Solution:
+        """Identify detections with the parameters of a request."""
+        return self._solve(self.identifier(request), found, request)
+
+    def _detect(self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel) -> Detections:
+        if self.images is None:
+            image, known = self._without_dark(exposure.image, request), sensor.detection_settings()
+        else:
+            image, known = exposure.image, DetectionSettings()
+        return detect(image, detection_settings(known, request.settings))
 
     def _preview(
         self,
@@ -269,13 +287,14 @@ class Pipeline:
                 window_px=float(min(settings.tracking_margin, *windows_px)),
                 observer_velocity=request.observer_velocity,
             )
-        if not solution.valid:
+        if not solution.valid or (solution.features is not None and not solution.features.refined):
             return solution
         if _within_margin(identifier, solution, xy, request) < settings.min_stars_matched:
             reason = (
                 Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
             )
-            return Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
+            rejected = Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
+            return replace(rejected, features=solution.features)
         if self._calibration is None:
             return solution
         camera, used = calibrated_camera(self.camera, settings), solution.detection_index
@@ -289,11 +308,28 @@ class Pipeline:
         options.setdefault("limiting_magnitude", settings.limiting_magnitude)
         if setup.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
             options.setdefault("zero_point", 2.5 * math.log10(self._sensor.zero_magnitude_e_s))
+            options.setdefault("colour_term", self._sensor.colour_term)
+            if "detected_limit" not in options:
+                found = self._measured_photometry
+                options |= {"detected_limit": found.limit} | {"magnitude_sigma": found.sigma, **options}
         camera = calibrated_camera(self.camera, settings)
         margin = settings.error_margin / 100.0
         return StarIdentifierSetup(
             setup.algorithm, camera, margin, tuple(sorted(options.items())), request.upsets
         )
+
+    @cached_property
+    def _measured_photometry(self) -> MeasuredPhotometry:
+        """The limit of the detector with the exposure of the profile."""
+        exposure_s = self._setup.exposure_s
+        known = self._sensor.with_(exposure_s=exposure_s).detection_settings()
+        settings = detection_settings(known, self._setup.settings)
+
+        def expose(attitude: Attitude, index: int) -> Frame:
+            return self._renderer.render(attitude, ZERO_RATE, index, exposure_s=exposure_s)
+
+        zero_e = self._sensor.zero_magnitude_e_s * exposure_s
+        return measure_photometry(expose, lambda frame: detect(frame.image, settings), zero_e)
 
     def _frame_result(
         self,
@@ -345,7 +381,8 @@ class Pipeline:
             matched=solution.star_count,
             stars=tuple(stars[:STARS_SENT]),
             probability_false=solution.probability_false if valid else 1.0,
-            rms_px=solution.rms_px if valid else 0.0,
+            rms_px=solution.rms_px if valid and solution.star_count else 0.0,
+            features=solution.features,
             background_dn=float(found.background),
             noise_dn=float(found.noise),
             render_s=rendered - begin,

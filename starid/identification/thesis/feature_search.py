@@ -1,4 +1,4 @@
-"""From the features of a circular field to attitudes worth verifying: neighbours in the database, and votes.
+"""From the stars of a circular field to boresights and attitudes, by their features.
 
 The circle is centred on the boresight of the camera, or elsewhere in the image (`FeatureSearch.turn`): a divided
 field is searched in several narrower circles, of which some contain no covered and no missing star.
@@ -7,41 +7,45 @@ field is searched in several narrower circles, of which some contain no covered 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arrays import Array, Indices, Mask
 from starid.attitude import Attitude
 from starid.attitude.wahba import solve_wahba
 from starid.camera import Camera
 from starid.identification.thesis.coarse_match import next_candidate
 from starid.identification.thesis.database import FeatureDatabase
 from starid.identification.thesis.features import FeatureVector, extract_features
-from starid.identification.thesis.frame_sky import UX, UZ
-from starid.identification.thesis.lsi import LostInSpace
+from starid.identification.thesis.frame_sky import UX, UZ, FrameSky
+from starid.identification.thesis.lsi import LostInSpace, LsiEstimate, LsiSolution
 
-MIN_STARS: Final = 5
+MIN_STARS: Final = 3
 """Fewest stars of a field that has features."""
 
-# The search is this project's, and so are its constants; the thesis takes the nearest cell.
-_MAGNITUDE_GATE: Final = 0.8
+# The search beyond the nearest cell is this project's, and so are its constants.
+_DOUBTFUL: Final = (0, -1, 1, -2, 2, -3, 3)
+"""How many stars nearest the brightness limit may be on its wrong side, because of the errors of their magnitudes."""
+_MAGNITUDE_GATE: Final = 0.5
 """Largest difference between a detection and the catalogue star for which it votes, mag."""
 _MAX_VOTERS: Final = 60
 """Number of detections that vote, the brightest first."""
 _VOTE_SHARE: Final = 0.25
 """Share that must vote for one rotation, of the detections or the catalogue stars, whichever are fewer."""
-_MIN_VOTES: Final = 6.0
+_MIN_VOTES: Final = 4.0
 """Least number of votes for one rotation."""
-_OFFSET_SHARE: Final = 0.055
-"""Largest error of a boresight that is worth a vote, as a share of the half-width of the circle."""
+CELL_SHARE: Final = 0.055
+"""Largest error of a neighbour's boresight that is worth a vote, as a share of the half-width of the circle."""
+ESTIMATE_SHARE: Final = 0.02
+"""The same for a boresight that the LASSO has interpolated."""
 _SPREAD: Final = 0.8
-"""Side of the spots, each of which is tried once, as a share of that error."""
+"""Side of the spots, each of which is tried once, as a share of the error of a neighbour's boresight."""
 _SPOTS_PER_BAND: Final = 100_000.0
 """Numbers reserved for the spots of one band of declination, more than there are."""
-_STAGES: Final = (200, 3000)
+_STAGES: Final = (30, 300)
 """Numbers of nearest cells tried before all are."""
 
 
@@ -63,6 +67,40 @@ class FieldStars:
     magnitude: Array
     row: Indices
 
+    def only(self, wanted: Mask) -> FieldStars:
+        """The stars that a mask of the detections selects."""
+        chosen = wanted[self.row]
+        return FieldStars(self.place[chosen], self.magnitude[chosen], self.row[chosen])
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureAnswer:
+    """What features say: algorithm 1 for one observation.
+
+    Attributes
+    ----------
+    solution
+        Nearest cell, dictionary, weights.
+    estimate
+        The estimate of least mean squared error.
+    attitude
+        Boresight and roll.
+    """
+
+    solution: LsiSolution
+    estimate: LsiEstimate
+    attitude: Attitude
+
+    @property
+    def error_psi(self) -> float:
+        """Error ε_ψ of the reconstruction."""
+        return self.estimate.error_psi
+
+    @property
+    def place(self) -> Array:
+        """Right ascension and declination of the boresight of the circle, degrees, (1, 2)."""
+        return np.array([[self.estimate.right_ascension_deg, self.estimate.declination_deg]])
+
 
 @dataclass(frozen=True, eq=False)
 class FeatureSearch:
@@ -78,12 +116,15 @@ class FeatureSearch:
         Largest number of neighbours tried, nearest first.
     turn
         Rotation (3, 3) that carries the centre of the circle to the boresight.
+    stars
+        The stars with which the detections of a candidate are paired, fainter ones than those of the features too.
     """
 
     camera: Camera
     lost_in_space: LostInSpace
     neighbours: int
     turn: Array
+    stars: FrameSky
 
     @property
     def database(self) -> FeatureDatabase:
@@ -91,9 +132,8 @@ class FeatureSearch:
         return self.lost_in_space.database
 
     @property
-    def offset_px(self) -> float:
-        """Largest error of a boresight that is worth a vote, pixels."""
-        return _OFFSET_SHARE * self.database.parameters.half_width_px
+    def _half_width_px(self) -> float:
+        return self.database.parameters.half_width_px
 
     def field_stars(self, xy: Array, flux: Array, zero_point: float) -> FieldStars:
         """Detections with flux in the circular field of the features, brightest first."""
@@ -101,57 +141,82 @@ class FeatureSearch:
         directions = self.camera.back_project(xy[rows]) @ self.turn.T
         with np.errstate(invalid="ignore", divide="ignore"):
             place = self.database.parameters.focal_px * directions[:, :2] / directions[:, 2:3]
-            inside = np.sum(place**2, axis=1) <= self.database.parameters.half_width_px**2
+            inside = np.sum(place**2, axis=1) <= self._half_width_px**2
         inside &= directions[:, 2] > 0.0
-        magnitude = zero_point - 2.5 * np.log10(flux[rows[inside]])
+        return self.field_of(place[inside], zero_point - 2.5 * np.log10(flux[rows[inside]]), rows[inside])
+
+    def field_of(self, place: Array, magnitude: Array, row: Indices | None = None) -> FieldStars:
+        """The same from offsets (n, 2), pixels, and magnitudes (n,); stars of infinite magnitude are left out."""
         order = np.argsort(magnitude, kind="stable")
-        return FieldStars(place[inside][order], magnitude[order], rows[inside][order])
+        order = order[np.isfinite(magnitude[order])]
+        rows = np.arange(magnitude.size) if row is None else row
+        return FieldStars(place[order], magnitude[order], rows[order])
+
+    def bright(self, field: FieldStars) -> int:
+        """Number of stars of the field within the brightness limit of the features."""
+        return int(np.searchsorted(field.magnitude, self.database.parameters.kappa, side="right"))
 
     def features(self, field: FieldStars) -> FeatureVector | None:
-        """Feature vector of the stars above the brightness limit; None if there are too few."""
-        bright = field.magnitude <= self.database.parameters.kappa
-        if np.count_nonzero(bright) < MIN_STARS:
+        """Feature vector of the stars within the brightness limit; None if there are too few."""
+        count = self.bright(field)
+        return None if count < MIN_STARS else extract_features(field.magnitude[:count], field.place[:count])
+
+    def doubtful_features(self, field: FieldStars) -> list[FeatureVector]:
+        """Feature vectors with some stars fewer or more, those nearest the brightness limit; the likeliest first."""
+        count = self.bright(field)
+        counts = [count + change for change in _DOUBTFUL]
+        return [
+            extract_features(field.magnitude[:n], field.place[:n])
+            for n in counts
+            if MIN_STARS <= n <= field.magnitude.size
+        ]
+
+    def answer(self, features: FeatureVector) -> FeatureAnswer:
+        """Algorithm 1: the nearest cell of the whole database, LASSO, boresight and roll."""
+        return self._answer(self.lost_in_space.solve(features), features)
+
+    def answer_in_region(
+        self, features: FeatureVector, centre: Attitude, side_deg: float
+    ) -> FeatureAnswer | None:
+        """The same with the nearest cell of a region; None if the region has no cell."""
+        lsi, observation = self.lost_in_space, self.database.normalise(features)
+        middle = Attitude.from_matrix(self.turn @ centre.matrix)
+        cell, distance, _ = lsi.nearest_in_region(observation, middle.ra_deg, middle.dec_deg, side_deg)
+        if cell < 0:
             return None
-        return extract_features(field.magnitude[bright], field.place[bright])
+        return self._answer(lsi.estimate(observation, cell, distance), features)
 
-    def coarse(self, features: FeatureVector) -> tuple[Attitude, Array]:
-        """Attitude as in the thesis, from one neighbour and LASSO, and its boresight (1, 2) in degrees."""
-        solution = self.lost_in_space.solve(features).mse
+    def _answer(self, solution: LsiSolution, features: FeatureVector) -> FeatureAnswer:
+        estimate = solution.mse
         x, y = math.cos(features.theta_rad), math.sin(features.theta_rad)
-        across = np.cross(solution.boresight, solution.pointer)
-        rows = [x * solution.pointer - y * across, y * solution.pointer + x * across, solution.boresight]
-        place = np.array([[solution.right_ascension_deg, solution.declination_deg]])
-        return Attitude.from_matrix(self.turn.T @ np.stack(rows)), place
+        across = np.cross(estimate.boresight, estimate.pointer)
+        rows = [x * estimate.pointer - y * across, y * estimate.pointer + x * across, estimate.boresight]
+        return FeatureAnswer(solution, estimate, Attitude.from_matrix(self.turn.T @ np.stack(rows)))
 
-    def _candidates(self, features: FeatureVector) -> Iterator[Array]:
-        """Yield boresights (k, 2), degrees: centres of growing numbers of nearest cells, none twice."""
-        observation = self.database.normalise(features)
-        most = min(self.neighbours, self.database.cells)
+    def attitudes_of(
+        self, field: FieldStars, observations: Sequence[FeatureVector]
+    ) -> Iterator[tuple[Attitude | None, int]]:
+        """The same as `attitudes`, from growing numbers of cells nearest to each of several feature vectors."""
         tried = np.empty(0)
+        most = min(self.neighbours, self.database.cells)
+        normalised = [self.database.normalise(features) for features in observations]
         for count in sorted({min(stage, most) for stage in (*_STAGES, most)}):
-            distances, cells = self.lost_in_space.neighbours(observation, count)
-            order = np.lexsort((cells, distances))
-            centres = self.cell_centres(cells[order][cells[order] >= 0])
-            spots = self._spots(centres)
-            first = np.sort(np.unique(spots, return_index=True)[1])
-            new = first[~np.isin(spots[first], tried)]
-            tried = np.concatenate([tried, spots[new]])
-            yield centres[new]
+            for observation in normalised:
+                distances, cells = self.lost_in_space.neighbours(observation, count)
+                order = np.lexsort((cells, distances))
+                centres = self.cell_centres(cells[order][cells[order] >= 0])
+                spots = self._spots(centres)
+                first = np.sort(np.unique(spots, return_index=True)[1])
+                new = first[~np.isin(spots[first], tried)]
+                tried = np.concatenate([tried, spots[new]])
+                yield from self.attitudes(field, centres[new], CELL_SHARE)
 
     def _spots(self, places: Array) -> Array:
         """Number the cells, of a grid just fine enough for the votes, that contain positions (n, 2)."""
-        step = math.degrees(_SPREAD * self.offset_px / self.database.parameters.focal_px)
+        step = math.degrees(_SPREAD * CELL_SHARE * self._half_width_px / self.database.parameters.focal_px)
         band = np.floor((places[:, 1] + 90.0) / step)
         columns = np.maximum(np.rint(360.0 * np.cos(np.radians((band + 0.5) * step - 90.0)) / step), 1.0)
         return np.asarray(band * _SPOTS_PER_BAND + np.floor(places[:, 0] / 360.0 * columns), dtype=np.float64)
-
-    def attitudes_of(
-        self, field: FieldStars, place: Array, features: FeatureVector
-    ) -> Iterator[tuple[Attitude | None, int]]:
-        """The same from a first boresight (1, 2), degrees, and then from growing numbers of nearest cells."""
-        yield from self.attitudes(field, place)
-        for places in self._candidates(features):
-            yield from self.attitudes(field, places)
 
     def cell_centres(self, cells: Indices) -> Array:
         """Right ascension and declination of cells, degrees, (n, 2)."""
@@ -160,23 +225,26 @@ class FeatureSearch:
         ra = grid.first_ra_deg + (cells - grid.row_start[row]) * grid.row_ra_step_deg[row]
         return np.column_stack([ra % 360.0, grid.row_dec_deg[row]])
 
-    def attitudes(self, field: FieldStars, candidates: Array) -> Iterator[tuple[Attitude | None, int]]:
+    def attitudes(
+        self, field: FieldStars, candidates: Array, share: float
+    ) -> Iterator[tuple[Attitude | None, int]]:
         """Yield attitudes with enough votes, from boresights (k, 2), and the number tried since the last.
 
-        The last item has no attitude unless the last candidate has one.
+        `share` is the largest error of a boresight, as a share of the half-width of the circle. The last item has no
+        attitude unless the last candidate has one.
         """
         voters = min(field.magnitude.size, _MAX_VOTERS)
         observed = np.column_stack([field.place[:voters], field.magnitude[:voters]])
-        sky = self.database.sky
-        settings = np.array([self.offset_px, _MAGNITUDE_GATE, _VOTE_SHARE, _MIN_VOTES])
+        settings = np.array([share * self._half_width_px, _MAGNITUDE_GATE, _VOTE_SHARE, _MIN_VOTES])
         matched = np.empty((voters, 2), dtype=np.int64)
         start = 0
         while start < len(candidates):
-            place, count = next_candidate(sky.arrays, observed, candidates, start, settings, matched)
+            place, count = next_candidate(self.stars.arrays, observed, candidates, start, settings, matched)
             if place < 0:
                 yield None, len(candidates) - start
                 return
             seen = field.place[matched[:count, 0]]
             body = np.column_stack([seen, np.full(count, self.database.parameters.focal_px)])
-            yield solve_wahba(body @ self.turn, sky.stars[matched[:count, 1], UX : UZ + 1]), place + 1 - start
+            icrs = self.stars.stars[matched[:count, 1], UX : UZ + 1]
+            yield solve_wahba(body @ self.turn, icrs), place + 1 - start
             start = place + 1

@@ -1,9 +1,13 @@
-"""The LSI algorithm for a real sensor: features on the sphere, many neighbours, and only verified answers.
+"""The LSI algorithm for a real sensor (algorithm 1 of the thesis), in two stages.
 
-Outside the plane of the thesis its nearest neighbour is right in only a third of the frames, because stars
-near the brightness limit come and go with the noise of their magnitudes. The nearest neighbours are therefore
-tried one after the other: the stars of each vote for a roll (`starid.identification.thesis.coarse_match`), a clear peak is
-paired star by star, and the resulting attitude is refined and verified by the geometric identifier.
+*Thesis*: the features of the field give the nearest cell, the cell its dictionary, and LASSO the boresight and roll.
+*Refinement*: from such attitudes detections are paired with stars, and the geometric identifier fits and verifies.
+
+On a real sky the nearest cell is the right one in a part of the fields only, since a star near the brightness limit is
+now within it and now not, with the noise of its magnitude. Three choices make it as large as it can be: the limit leaves
+some ten stars a field and is never fainter than what the sensor finds (`LsiOptions.feature_limit`); the magnitudes are
+those of the sensor, with its zero point and colour term; and the refinement also tries the cells nearest to the features
+with a star or two fewer or more (`FeatureSearch.doubtful_features`).
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starid.arrays import Array
+from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
@@ -28,24 +32,44 @@ from starid.identification.geometric.identifier import Identifier
 from starid.identification.geometric.pattern_index import resolved_stars
 from starid.identification.geometric.verified import VerifiedIdentifier
 from starid.identification.single_camera import CheckedDetections
-from starid.identification.solution import Reason, Solution
-from starid.identification.thesis.database import DatabaseParameters
+from starid.identification.solution import FeatureReport, Reason, Solution
+from starid.identification.thesis.database import DatabaseParameters, sky_of
 from starid.identification.thesis.database_choice import given_database, obtain_database
-from starid.identification.thesis.feature_search import MIN_STARS, FeatureSearch
+from starid.identification.thesis.feature_error import FeatureErrors, Photometry
+from starid.identification.thesis.feature_search import (
+    ESTIMATE_SHARE,
+    MIN_STARS,
+    FeatureAnswer,
+    FeatureSearch,
+    FieldStars,
+)
 from starid.identification.thesis.lsi import LostInSpace, Solver
 
-STARS_PER_FIELD: Final = 60
-"""Number of stars per field for the default brightness limit of the features."""
+STARS_PER_FIELD: Final = 10
+"""Number of stars per field for the default brightness limit of the features: fewer make fields alike, and with more
+some are always on the wrong side of the limit."""
+
+REGION_DEG: Final = 2.0
+"""Least side of a region of search, degrees."""
+
+STARS_PER_MATCH: Final = 60
+"""Number of stars per field that are paired with detections."""
 
 WINDOW_PX: Final = 12.0
 """Window in which a candidate is verified, pixels."""
 
+SOLAR_COLOUR_B_V: Final = 0.65
+"""B−V of a star for which the colour term is zero; also taken for stars of unknown colour."""
+
+_TAU_REFINED: Final = 1.0
+_TAU_ALONE: Final = 0.5
+_DEFAULT_SIGMA_MAG: Final = 0.1
+_DEEPER_MAG: Final = 0.5
 _ZERO_POINT_STEPS: Final = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5)
 _ZERO_POINT_STAR: Final = 25
 _BLEND_PX: Final = 2.0
 _CIRCLE_SHARE: Final = 0.5
 """Width of a circle of a divided field, and distance of the outer ones from the centre, as shares of the field's."""
-_CIRCLE_NEIGHBOURS: Final = 3000
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +79,7 @@ class LsiReport:
     Attributes
     ----------
     coarse
-        Attitude as in the thesis: one nearest neighbour, LASSO, roll from the polar angle; or None.
+        Attitude of the first stage for the whole field; None if it had too few stars.
     tried
         Number of candidates for which the stars voted.
     verified
@@ -76,14 +100,30 @@ class LsiOptions:
 
     Attributes
     ----------
+    refinement
+        Refine and verify the attitude with matched stars. Otherwise it is that of the features alone, to about a degree
+        and with the uncertainty of simulated fields (`starid.identification.thesis.feature_error`).
+    tau
+        Threshold τ on ε_ψ, beyond which the answer from a region of search is not good enough. By default the two of
+        the thesis: 1 with refinement, which verifies what it lets pass, and 0.5 without.
+    invalid_factor
+        Factor K: features with ε_ψ > K·τ give no attitude.
     feature_limit
-        Faintest V of the stars in the features; default: for about 60 per field. The sensor must see deeper.
+        Brightness limit κ: faintest magnitude of the stars in the features; default: for ten stars per field, but
+        not fainter than `detected_limit`.
+    detected_limit
+        Magnitude at which the sensor finds 90 % of the stars; a device measures it on its own images. By default all
+        stars within the brightness limit are found.
+    magnitude_sigma
+        One-sigma error of a magnitude at that limit; a device measures it too.
+    colour_term
+        The sensor's magnitude is V − colour_term·(B−V − 0.65).
     overlap
         Overlap ratio of the database.
     neighbours
-        Largest number of neighbours tried, nearest first.
+        Largest number of neighbours tried by the refinement for each feature vector, nearest first.
     zero_point
-        V magnitude of unit flux, if it is known. Otherwise it is learned: each answer determines it, and for
+        Magnitude of unit flux, if it is known. Otherwise it is learned: each answer determines it, and for
         the next frame that value is tried first, and then guesses from the frame.
     limiting_magnitude
         Faintest V of the verification (see `Identifier`).
@@ -93,14 +133,20 @@ class LsiOptions:
         Keep the database and the index in the cache folder.
     divided
         If the whole field has no answer, search nine circles of half its width (section 7.2 of the thesis): for a field
-        that a body covers in part. Needs a second database; every search then tries at most 3000 neighbours.
+        that a body covers in part. Needs a second database, and the refinement.
     solver
         Solver of nearest neighbour and LASSO: "exact", "matlab" or "sklearn" (see `LostInSpace`).
     """
 
+    refinement: bool = True
+    tau: float | None = None
+    invalid_factor: float = 10.0
     feature_limit: float | None = None
+    detected_limit: float | None = None
+    magnitude_sigma: float = _DEFAULT_SIGMA_MAG
+    colour_term: float = 0.0
     overlap: float = 0.99
-    neighbours: int = 30_000
+    neighbours: int = 10_000
     zero_point: float | None = None
     limiting_magnitude: float | None = None
     database: str | Path | None = None
@@ -111,6 +157,26 @@ class LsiOptions:
     def __post_init__(self) -> None:
         if self.neighbours < 1:
             raise StaridError(f"lsi neighbours: must be at least 1, not {self.neighbours}")
+        if not (self.threshold > 0.0 and self.invalid_factor > 0.0):
+            raise StaridError(
+                f"lsi tau, invalid_factor: must be positive, not {self.tau}, {self.invalid_factor}"
+            )
+        if self.divided and not self.refinement:
+            raise StaridError(
+                "lsi divided: needs refinement = true, because only matched stars tell which circle is right"
+            )
+
+    @property
+    def threshold(self) -> float:
+        """The threshold τ on ε_ψ, as given or the default."""
+        if self.tau is not None:
+            return self.tau
+        return _TAU_REFINED if self.refinement else _TAU_ALONE
+
+    @property
+    def largest_error_psi(self) -> float:
+        """The largest ε_ψ of features that give an attitude, K·τ."""
+        return self.invalid_factor * self.threshold
 
 
 class LsiIdentifier(VerifiedIdentifier):
@@ -146,118 +212,254 @@ class LsiIdentifier(VerifiedIdentifier):
         super().__init__(camera, catalog)
         if len(self._catalog) == 0:
             raise StaridError("identifier catalog: contains no stars")
+        self.options = options
+        self._sensor_magnitudes = _sensor_magnitudes(self._catalog, options.colour_term)
         probe = DatabaseParameters.for_camera(camera, overlap=options.overlap, kappa=0.0)
         share = 0.5 * (1.0 - math.cos(math.radians(0.5 * probe.fov_deg)))
-        limit = self._limit_for(share) if options.feature_limit is None else options.feature_limit
-        parameters = dataclasses.replace(probe, kappa=limit)
-        seen = resolved_stars(self._catalog, limit + 1.0, _BLEND_PX / camera.focal_px[0])
+        parameters = dataclasses.replace(probe, kappa=self._feature_limit(share))
+        deep = max(self._limit_for(STARS_PER_MATCH, share), parameters.kappa)
+        if options.detected_limit is not None:
+            deep = min(deep, max(options.detected_limit + _DEEPER_MAG, parameters.kappa))
+        seen = self._seen_stars(deep + 1.0)
         self.database = (
             obtain_database(seen, parameters, cache=options.cache)
             if options.database is None
             else given_database(Path(options.database), parameters, (self._catalog.identity, seen.identity))
         )
-        neighbours = min(options.neighbours, _CIRCLE_NEIGHBOURS) if options.divided else options.neighbours
+        stars = sky_of(seen, dataclasses.replace(parameters, kappa=deep))
         self.search = FeatureSearch(
-            camera, LostInSpace(self.database, solver=options.solver), neighbours, np.identity(3)
+            camera,
+            LostInSpace(self.database, solver=options.solver),
+            options.neighbours,
+            np.identity(3),
+            stars,
         )
-        self._circles = self._divided(seen, options) if options.divided else []
+        self._circles = self._divided(seen, deep) if options.divided else []
         self._given_zero_point = options.zero_point
         self._zero_point = options.zero_point
         self._star_magnitude = self._magnitude_of_rank(share)
-        self._verifier = Identifier(
-            camera, self._catalog, limiting_magnitude=options.limiting_magnitude, cache=options.cache
+        self._verifier = (
+            Identifier(
+                camera, self._catalog, limiting_magnitude=options.limiting_magnitude, cache=options.cache
+            )
+            if options.refinement
+            else None
         )
+        self.errors = None if options.refinement else self._feature_errors()
         self.last_report = LsiReport(None, 0, 0, math.nan)
 
-    def _divided(self, seen: StarCatalog, options: LsiOptions) -> list[FeatureSearch]:
+    def _feature_errors(self) -> FeatureErrors:
+        limit = self.options.detected_limit
+        photometry = Photometry(
+            self.database.parameters.kappa + 1.0 if limit is None else limit, self.options.magnitude_sigma
+        )
+        return FeatureErrors.of_search(self.search, photometry, REGION_DEG)
+
+    def _seen_stars(self, limit: float) -> StarCatalog:
+        """Stars to a magnitude as the sensor sees them: unresolved ones merged, with its own magnitudes as `v`."""
+        resolved = resolved_stars(self._catalog, limit, _BLEND_PX / self._camera.focal_px[0])
+        magnitudes = _sensor_magnitudes(resolved, self.options.colour_term)
+        order = np.argsort(magnitudes, kind="stable")
+        return dataclasses.replace(resolved.subset(order), v=magnitudes[order])
+
+    def _divided(self, seen: StarCatalog, deep: float) -> list[FeatureSearch]:
         """The searches of nine circles of the field, which share a database: the middle, and eight around it."""
         whole = self.database.parameters
         half = _CIRCLE_SHARE * math.radians(0.5 * whole.fov_deg)
+        share = 0.5 * (1.0 - math.cos(half))
         parameters = dataclasses.replace(
-            whole, fov_deg=_CIRCLE_SHARE * whole.fov_deg, half_width_px=whole.focal_px * math.tan(half)
+            whole,
+            fov_deg=_CIRCLE_SHARE * whole.fov_deg,
+            half_width_px=whole.focal_px * math.tan(half),
+            overlap=1.0 - (1.0 - whole.overlap) / _CIRCLE_SHARE,
+            kappa=self._feature_limit(share),
         )
-        database = obtain_database(seen, parameters, cache=options.cache)
-        lost_in_space = LostInSpace(database, solver=options.solver)
+        deep = max(deep, parameters.kappa)
+        database = obtain_database(seen, parameters, cache=self.options.cache)
+        lost_in_space = LostInSpace(database, solver=self.options.solver)
+        stars = sky_of(seen, dataclasses.replace(parameters, kappa=deep))
         ring = [
             half * np.array([math.sin(turn), -math.cos(turn), 0.0]) for turn in np.arange(8) * math.pi / 4.0
         ]
         return [
             dataclasses.replace(
-                self.search, lost_in_space=lost_in_space, turn=Rotation.from_rotvec(away).as_matrix()
+                self.search,
+                lost_in_space=lost_in_space,
+                turn=Rotation.from_rotvec(away).as_matrix(),
+                stars=stars,
             )
             for away in (np.zeros(3), *ring)
         ]
 
     @property
     def verifier(self) -> Identifier:
-        """The geometric identifier that verifies answers and tracks."""
+        """The geometric identifier that refines and verifies answers."""
+        if self._verifier is None:
+            raise StaridError("lsi refinement: is off, so there is no verification")
         return self._verifier
 
     @property
     def zero_point(self) -> float | None:
-        """V magnitude of unit flux, as given or as learned from the last answer; None if neither."""
+        """Magnitude of unit flux, as given or as learned from the last answer; None if neither."""
         return self._zero_point
 
     @property
     def database_bytes(self) -> int:
         """Size of the feature databases (five bytes per cell) and of the index for verification, bytes."""
         cells = sum(search.database.cells for search in (self.search, *self._circles[:1]))
-        return 5 * cells + self.verifier.database_bytes
+        return 5 * cells + (0 if self._verifier is None else self._verifier.database_bytes)
 
     def reset(self) -> None:
         """Forget the learned zero point; the given one, if any, is used again."""
         self._zero_point = self._given_zero_point
 
-    def _limit_for(self, share: float) -> float:
-        v = np.sort(self._catalog.v)
-        row = min(int(STARS_PER_FIELD / share), v.size) - 1
+    def _feature_limit(self, share: float) -> float:
+        """Brightness limit κ of a circle that is a share of the sky."""
+        if self.options.feature_limit is not None:
+            return self.options.feature_limit
+        found = math.inf if self.options.detected_limit is None else self.options.detected_limit
+        return min(self._limit_for(STARS_PER_FIELD, share), found)
+
+    def _limit_for(self, stars: int, share: float) -> float:
+        v = np.sort(self._sensor_magnitudes)
+        row = min(int(stars / share), v.size) - 1
         return math.ceil(10.0 * float(v[row])) / 10.0
 
     def _magnitude_of_rank(self, share: float) -> float:
-        """V magnitude of the star of rank `_ZERO_POINT_STAR` in an average field."""
-        v = np.sort(self._catalog.v)
+        """Magnitude of the star of rank `_ZERO_POINT_STAR` in an average field."""
+        v = np.sort(self._sensor_magnitudes)
         return float(v[min(int(_ZERO_POINT_STAR / share), v.size - 1)])
 
     def warm_up(self) -> None:
         """Compile or load the kernels, so that the first frame is not late."""
-        self.verifier.warm_up()
-        xy = self._camera.border(4)[:MIN_STARS] * 0.25 + 0.375 * np.array(
+        if self._verifier is not None:
+            self._verifier.warm_up()
+        xy = self._camera.border(4)[: MIN_STARS + 3] * 0.25 + 0.375 * np.array(
             [self._camera.width, self._camera.height]
         )
-        self._first_verified(CheckedDetections.of(xy, np.ones(len(xy))), [0.0])
+        self.solve(CheckedDetections.of(xy, np.ones(len(xy))), [0.0])
 
     def _identify(self, measured: CheckedDetections) -> Solution:
-        solution = self._first_verified(measured, self._zero_points(measured.flux))
+        return self.solve(measured, self.zero_points(measured.flux))
+
+    def _track(self, measured: CheckedDetections, predicted: Attitude, window_px: float | None) -> Solution:
+        """Find the attitude from the features, as `identify`: the algorithm uses no prediction."""
+        del predicted, window_px
+        return self._identify(measured)
+
+    def solve(
+        self,
+        measured: CheckedDetections,
+        zero_points: Sequence[float],
+        first: Sequence[FeatureAnswer] = (),
+        kept: Mask | None = None,
+    ) -> Solution:
+        """Search the whole database: stage one, and with refinement stage two.
+
+        `first` are answers to compare with that of the whole database, and `kept` is a mask of the detections from which
+        features are computed; by default all.
+        """
+        solution = (
+            self._first_verified(measured, zero_points, first, kept)
+            if self.options.refinement
+            else self._by_features(measured, zero_points, first, kept)
+        )
         if solution.valid:
             self.learn(solution, measured.flux)
         return solution
 
-    def _first_verified(self, measured: CheckedDetections, zero_points: Sequence[float]) -> Solution:
-        """Try the zero points in order, each in the whole field and then in the circles; return the first verified answer."""
-        tried = verified = 0
-        coarse: Attitude | None = None
-        enough = False
-        for zero_point, search in itertools.product(zero_points, (self.search, *self._circles)):
-            field = search.field_stars(measured.xy, measured.flux, zero_point)
-            features = search.features(field)
+    def _fields(
+        self, measured: CheckedDetections, search: FeatureSearch, zero_point: float, kept: Mask | None
+    ) -> FieldStars:
+        field = search.field_stars(measured.xy, measured.flux, zero_point)
+        return field if kept is None else field.only(kept)
+
+    def _by_features(
+        self,
+        measured: CheckedDetections,
+        zero_points: Sequence[float],
+        first: Sequence[FeatureAnswer],
+        kept: Mask | None,
+    ) -> Solution:
+        """The attitude of the features alone, at the first zero point for which there are any."""
+        for zero_point in zero_points:
+            features = self.search.features(self._fields(measured, self.search, zero_point, kept))
             if features is None:
                 continue
+            answers = (*first, self.search.answer(features))
+            best = min(answers, key=lambda answer: answer.error_psi)
+            self.last_report = LsiReport(answers[-1].attitude, 0, 0, zero_point)
+            return self.by_features_alone(best)
+        self.last_report = LsiReport(None, 0, 0, math.nan)
+        return Solution.invalid(Reason.TOO_FEW_STARS)
+
+    def by_features_alone(self, answer: FeatureAnswer, wrong: float | None = None) -> Solution:
+        """The solution of the first stage; invalid if ε_ψ > K·τ.
+
+        `wrong` is the probability that it is at another place of the sky; by default that of the whole database.
+        """
+        report = report_of(answer, "lsi")
+        psi = answer.error_psi
+        if self.errors is None or psi > self.options.largest_error_psi:
+            return dataclasses.replace(Solution.invalid(Reason.RESIDUAL), features=report)
+        likely = float(self.errors.wrong[self.errors.row(psi)]) if wrong is None else wrong
+        return Solution(
+            valid=True,
+            reason=Reason.OK,
+            quaternion_xyzw=answer.attitude.quaternion_xyzw,
+            covariance=self.errors.covariance(psi, likely),
+            probability_false=likely,
+            features=report,
+        )
+
+    def _first_verified(
+        self,
+        measured: CheckedDetections,
+        zero_points: Sequence[float],
+        first: Sequence[FeatureAnswer],
+        kept: Mask | None,
+    ) -> Solution:
+        """Try the zero points in order, each in the whole field and then in the circles; return the first verified answer."""
+        tried = verified = 0
+        coarse: FeatureAnswer | None = None
+        enough = False
+        for zero_point, search in itertools.product(zero_points, (self.search, *self._circles)):
+            field = self._fields(measured, search, zero_point, kept)
+            observations = search.doubtful_features(field)
+            features = search.features(field)
+            if not observations:
+                continue
             enough = True
-            first, place = search.coarse(features)
-            coarse = coarse or first
-            for attitude, attempts in search.attitudes_of(field, place, features):
+            answers: list[FeatureAnswer] = []
+            if features is not None:
+                answer = search.answer(features)
+                coarse = coarse or answer
+                answers = sorted((*first, answer), key=lambda each: each.error_psi)
+            usable = [each.place for each in answers if each.error_psi <= self.options.largest_error_psi]
+            candidates = itertools.chain(
+                *(search.attitudes(field, place, ESTIMATE_SHARE) for place in usable),
+                search.attitudes_of(field, observations),
+            )
+            for attitude, attempts in candidates:
                 tried += attempts
                 if attitude is None:
                     continue
                 verified += 1
                 solution = self.verify(measured, attitude, WINDOW_PX)
                 if solution.valid:
-                    self.last_report = LsiReport(coarse, tried, verified, zero_point)
-                    return dataclasses.replace(solution, mode="lost_in_space")
-        self.last_report = LsiReport(coarse, tried, verified, math.nan)
-        return Solution.invalid(Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS)
+                    self._report(coarse, tried, verified, zero_point)
+                    return dataclasses.replace(
+                        solution, mode="lost_in_space", features=report_of(coarse, "lsi", refined=True)
+                    )
+        self._report(coarse, tried, verified, math.nan)
+        failed = Solution.invalid(Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS)
+        return dataclasses.replace(failed, features=report_of(coarse, "lsi"))
 
-    def _zero_points(self, flux: Array) -> list[float]:
+    def _report(self, coarse: FeatureAnswer | None, tried: int, verified: int, zero_point: float) -> None:
+        attitude = None if coarse is None else coarse.attitude
+        self.last_report = LsiReport(attitude, tried, verified, zero_point)
+
+    def zero_points(self, flux: Array) -> list[float]:
         """Zero points to try: the given one, or the learned one and then guesses from the frame."""
         if self._given_zero_point is not None:
             return [self._given_zero_point]
@@ -272,6 +474,33 @@ class LsiIdentifier(VerifiedIdentifier):
     def learn(self, solution: Solution, flux: Array) -> None:
         """Learn the zero point from the matched stars of a valid answer, if none was given."""
         if self._given_zero_point is None and solution.star_count >= MIN_STARS:
-            magnitudes = self._catalog.v[solution.catalog_index]
+            magnitudes = self._sensor_magnitudes[solution.catalog_index]
             found = magnitudes + 2.5 * np.log10(np.maximum(flux[solution.detection_index], 1e-30))
             self._zero_point = float(np.median(found))
+
+
+def report_of(answer: FeatureAnswer | None, search: Any, **others: Any) -> FeatureReport:
+    """What the first stage did, for `Solution.features`."""
+    if answer is None:
+        return FeatureReport(search, **others)
+    solution = answer.solution
+    return FeatureReport(
+        search,
+        error_psi=answer.error_psi,
+        cell=solution.nearest,
+        weights=int(np.count_nonzero(answer.estimate.omega)),
+        observed=_five(solution.observation),
+        of_cell=_five(solution.dictionary[:, solution.cells == solution.nearest][:, 0]),
+        **others,
+    )
+
+
+def _five(values: Array) -> tuple[float, float, float, float, float]:
+    a, b, c, d, e = values.tolist()
+    return a, b, c, d, e
+
+
+def _sensor_magnitudes(catalog: StarCatalog, colour_term: float) -> Array:
+    """Magnitudes (n,) as a sensor with a colour term measures them."""
+    colour = np.nan_to_num(catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
+    return np.asarray(catalog.v - colour_term * colour, dtype=np.float64)

@@ -1,7 +1,9 @@
-"""The RSI algorithm for a real sensor: filter, motion, a search region on the sphere, and LSI if that fails.
+"""The RSI algorithm for a real sensor (algorithm 3 of the thesis): filter, motion, region of search, and LSI.
 
-It is the thesis's recursion with one difference: whether the answer from the region is good enough is decided
-not by ε_ψ, which says little on the sphere and with stars near the brightness limit, but by verification.
+The false-star filter (FSF) compares each image with those before it. The motion of its true stars (CME) carries the last
+attitude to the present image; the cells of a region around it (eq. 6.5) are searched for the features of the true
+stars. If ε_ψ > τ, the whole database is searched as well, and the answer with the smaller ε_ψ is kept; one with
+ε_ψ > K·τ is invalid. With refinement, an answer that is not verified counts as one with ε_ψ > τ.
 """
 
 from __future__ import annotations
@@ -15,19 +17,28 @@ import numpy as np
 
 from starid.arrays import Array, Mask
 from starid.attitude import Attitude
+from starid.attitude.wahba import solve_wahba
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.identification.single_camera import CheckedDetections, SingleCameraIdentifier
-from starid.identification.solution import Reason, Solution
+from starid.identification.solution import FeatureReport, Solution
 from starid.identification.thesis.cme import matched_motion
 from starid.identification.thesis.false_stars import ObservedFrame
-from starid.identification.thesis.feature_search import FieldStars
-from starid.identification.thesis.lsi_identifier import WINDOW_PX, LsiIdentifier, LsiOptions
+from starid.identification.thesis.feature_search import ESTIMATE_SHARE, FeatureAnswer, FieldStars
+from starid.identification.thesis.lsi_identifier import (
+    REGION_DEG,
+    WINDOW_PX,
+    LsiIdentifier,
+    LsiOptions,
+    report_of,
+)
 from starid.identification.thesis.rsi import RsiSettings, region_side
-from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings
+from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings, rays
 
 _MIN_MATCHES: Final = 3
-_SPOT_DEG: Final = 1.0
+_ENOUGH_MATCHES: Final = 8
+"""Number of matches that two images of different fields do not have by chance."""
+_LEAST_WRONG: Final = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +52,7 @@ class RsiStatistics:
     in_region
         Number of frames answered from the search region.
     triggers
-        Number of frames for which the region failed and the whole database was searched.
+        Number of frames for which the whole database was searched because the region's answer was not good enough.
     invalid
         Number of frames without an answer.
     region_sum_deg
@@ -71,10 +82,47 @@ class RsiOptions(LsiOptions):
         One-sigma error of a position per axis, pixels, as assumed by the filter.
     """
 
-    gamma_min_deg: float = 2.0
+    gamma_min_deg: float = REGION_DEG
     gamma_scale: float = 1.0
     filter_false_stars: bool = True
     position_sigma_px: float = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Preprocessed:
+    """What filter and motion estimation say about an image.
+
+    Attributes
+    ----------
+    true_stars
+        Which detections are stars, by previous images, (n,); all if nothing is known.
+    removed
+        Number of detections that are not.
+    rotation
+        Rotation of the sky from the previous image to this one in the sensor frame, (3, 3); None if it is unknown.
+    rotation_deg, translation_deg
+        The same as rotation γ̃ about the boresight and length of the translation ρ̃, degrees; 0 if unknown.
+    side_deg
+        Side of the region of search, eq. 6.5, degrees.
+    """
+
+    true_stars: Mask
+    removed: int
+    rotation: Array | None
+    rotation_deg: float
+    translation_deg: float
+    side_deg: float
+
+    def add_to(self, report: FeatureReport | None, **others: Any) -> FeatureReport:
+        """Add filter and motion to the report of the features."""
+        return dataclasses.replace(
+            FeatureReport("lsi") if report is None else report,
+            stars=self.true_stars.size - self.removed,
+            removed=self.removed,
+            rotation_deg=self.rotation_deg,
+            translation_deg=self.translation_deg,
+            **others,
+        )
 
 
 class RsiIdentifier(SingleCameraIdentifier):
@@ -100,7 +148,13 @@ class RsiIdentifier(SingleCameraIdentifier):
         options = dataclasses.replace(options or RsiOptions(), **changes)
         self.lsi = LsiIdentifier(camera, catalog, options)
         super().__init__(camera, self.lsi.catalog)
-        self._settings = RsiSettings(gamma_min_deg=options.gamma_min_deg, gamma_scale=options.gamma_scale)
+        self.options = options
+        self._settings = RsiSettings(
+            tau=options.threshold,
+            invalid_factor=options.invalid_factor,
+            gamma_min_deg=options.gamma_min_deg,
+            gamma_scale=options.gamma_scale,
+        )
         scale = math.degrees(1.0 / camera.focal_px[0])
         half_field = 0.5 * self.lsi.database.parameters.fov_deg
         self._filter = (
@@ -110,12 +164,15 @@ class RsiIdentifier(SingleCameraIdentifier):
                     brightness_sigma=0.3,
                     max_rotation_deg=15.0,
                     max_shift_deg=0.5 * half_field,
+                    geometry="spherical",
                 )
             )
             if options.filter_false_stars
             else None
         )
         self._before: ObservedFrame | None = None
+        self._last: Attitude | None = None
+        self._wrong = 1.0
         self.statistics = RsiStatistics()
 
     @property
@@ -134,53 +191,88 @@ class RsiIdentifier(SingleCameraIdentifier):
     def reset(self) -> None:
         """Forget previous frames, the learned zero point and the statistics."""
         self.lsi.reset()
-        self._before = None
+        self._before = self._last = None
         if self._filter is not None:
             self._filter.reset()
         self.statistics = RsiStatistics()
 
     def _identify(self, measured: CheckedDetections) -> Solution:
-        self._stars_and_region_side(measured.xy, measured.flux)
-        return self._whole_sky(measured)
+        """Find the attitude in the whole database, from the stars that the filter keeps."""
+        known = self._preprocess(measured.xy, measured.flux)
+        solution = self._whole_sky(measured, known)
+        self._remember(solution)
+        return dataclasses.replace(solution, features=known.add_to(solution.features))
 
-    def _whole_sky(self, measured: CheckedDetections) -> Solution:
-        """Identify with the LSI algorithm."""
-        return self.lsi.identify(
-            measured.xy,
-            measured.flux,
-            measured.given_sigmas,
-            observer_velocity=measured.observer_velocity,
-        )
+    def _whole_sky(
+        self, measured: CheckedDetections, known: Preprocessed, first: tuple[FeatureAnswer, ...] = ()
+    ) -> Solution:
+        """LSI, line 12 of algorithm 3: from the true stars and, if that fails, from all detections."""
+        zero_points = self.lsi.zero_points(measured.flux)
+        solution = self.lsi.solve(measured, zero_points, first, known.true_stars)
+        if solution.valid or known.removed == 0:
+            return solution
+        unfiltered = self.lsi.solve(measured, zero_points)
+        return unfiltered if unfiltered.valid else solution
 
     def _track(self, measured: CheckedDetections, predicted: Attitude, window_px: float | None) -> Solution:
-        """Find the attitude in the search region around a predicted one, or in the whole sky if that fails.
+        """Find the attitude in the region of search, or in the whole sky if that is not good enough.
 
-        The prediction only defines the region; its roll, and its error within the region, do not matter. If
-        the window is wider than the region, the region is widened to it, up to the field of view.
+        The centre of the region is the last attitude, carried by the measured motion. Only without it, as after a
+        missing image, is it the prediction given; the region is then at least as wide as the window.
         """
-        true_stars, side = self._stars_and_region_side(measured.xy, measured.flux)
-        if window_px is not None:
-            side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
+        known = self._preprocess(measured.xy, measured.flux)
+        side = known.side_deg
+        if self._last is not None and known.rotation is not None:
+            centre = Attitude.from_matrix(known.rotation @ self._last.matrix)
+        else:
+            centre = predicted
+            if window_px is not None:
+                side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
         side = min(side, self.lsi.database.parameters.fov_deg)
-        solution = self._in_region(measured, true_stars, predicted, side)
-        triggered = not solution.valid
-        if triggered:
-            solution = self._whole_sky(measured)
+        field, answers = self._in_region(measured, known, centre, side)
+        solution = None if field is None else self._accepted(measured, known, field, answers)
+        triggered = solution is None
+        if solution is None:
+            solution = self._whole_sky(measured, known, answers[:1])
+        self._count(solution, side, triggered=triggered)
+        self._remember(solution)
+        report = known.add_to(solution.features, triggered=triggered, region_deg=side)
+        return dataclasses.replace(solution, features=report)
+
+    def _remember(self, solution: Solution) -> None:
+        self._last = solution.attitude if solution.valid else None
+        self._wrong = solution.probability_false
+
+    def _place_wrong(self, answer: FeatureAnswer, known: Preprocessed) -> float:
+        """Probability that the region is at another place of the sky, by Bayes' rule from the last image's.
+
+        The features say something new only as far as other stars are seen: in proportion to the motion, up to a cell.
+        """
+        errors = self.lsi.errors
+        if errors is None:
+            return self._wrong
+        new = min(known.translation_deg / self.lsi.database.grid.step_deg, 1.0)
+        odds = self._wrong / max(1.0 - self._wrong, _LEAST_WRONG)
+        odds *= float(errors.ratio[errors.row(answer.error_psi)]) ** new
+        return max(float(odds / (1.0 + odds)), _LEAST_WRONG)
+
+    def _count(self, solution: Solution, side_deg: float, *, triggered: bool) -> None:
         old = self.statistics
         self.statistics = RsiStatistics(
             old.frames + 1,
             old.in_region + (not triggered),
             old.triggers + triggered,
             old.invalid + (not solution.valid),
-            old.region_sum_deg + side,
+            old.region_sum_deg + side_deg,
         )
-        return solution
 
-    def _stars_and_region_side(self, xy: Array, flux: Array) -> tuple[Mask, float]:
-        """Return which detections are stars, by previous frames, and the side of the search region."""
-        everything = np.ones(flux.size, dtype=np.bool_)
+    def _preprocess(self, xy: Array, flux: Array) -> Preprocessed:
+        """FSF and CME, lines 6 to 8 of algorithm 3."""
+        unknown = Preprocessed(
+            np.ones(flux.size, dtype=np.bool_), 0, None, 0.0, 0.0, self._settings.gamma_min_deg
+        )
         if self._filter is None:
-            return everything, self._settings.gamma_min_deg
+            return unknown
         usable = np.flatnonzero(flux > 0.0)[:MAX_OBJECTS]
         directions = self.camera.back_project(xy[usable])
         ahead = np.isfinite(directions).all(axis=1) & (directions[:, 2] > 0.0)
@@ -189,56 +281,80 @@ class RsiIdentifier(SingleCameraIdentifier):
         frame = ObservedFrame(-2.5 * np.log10(flux[usable]), positions)
         before, self._before = self._before, frame
         if before is None:
-            return everything, self._settings.gamma_min_deg
+            return unknown
         result = self._filter(before, frame)
-        if result.matches.shape[0] < _MIN_MATCHES:
-            return everything, self._settings.gamma_min_deg
+        needed = min(_ENOUGH_MATCHES, 0.5 * min(len(before), len(frame)))
+        if result.matches.shape[0] < max(_MIN_MATCHES, needed):
+            return unknown
         motion = matched_motion(before, frame, result.matches)
         if motion is None:
-            return everything, self._settings.gamma_min_deg
+            return unknown
         true_stars = np.zeros(flux.size, dtype=np.bool_)
         true_stars[usable] = result.true_now
-        side = region_side(motion.mean_distance_deg, motion.sigma_distance_deg, self._settings)
-        return true_stars, side
+        pairs = result.matches[motion.inliers]
+        if len(pairs) < _MIN_MATCHES:
+            return unknown
+        then, now = _directions(before.positions[pairs[:, 0]]), _directions(frame.positions[pairs[:, 1]])
+        rotation = solve_wahba(now, then).matrix
+        distance_deg = np.degrees(np.linalg.norm(then @ rotation.T - now, axis=1))
+        return Preprocessed(
+            true_stars,
+            int(np.count_nonzero(~true_stars)),
+            rotation,
+            motion.rotation_deg,
+            math.hypot(*motion.translation_deg),
+            region_side(float(distance_deg.mean()), float(distance_deg.std(ddof=1)), self._settings),
+        )
 
     def _in_region(
-        self, measured: CheckedDetections, true_stars: Mask, predicted: Attitude, side_deg: float
-    ) -> Solution:
-        """Try the cells of the region, most likely first; return the first verified answer."""
+        self, measured: CheckedDetections, known: Preprocessed, centre: Attitude, side_deg: float
+    ) -> tuple[FieldStars | None, tuple[FeatureAnswer, ...]]:
+        """The field's stars, and the answers of the cells of the region that are nearest to its features.
+
+        The first answer is that of the features as seen. With refinement, those of features with a star or two fewer or more
+        follow, the smallest ε_ψ first.
+        """
         search, zero_point = self.lsi.search, self.lsi.zero_point
         if zero_point is None:
-            return Solution.invalid(Reason.NO_MATCH, mode="tracking")
-        field = search.field_stars(measured.xy, measured.flux, zero_point)
-        trusted = true_stars[field.row]
-        chosen = FieldStars(field.place[trusted], field.magnitude[trusted], field.row[trusted])
-        features = search.features(chosen)
-        if features is None:
-            return Solution.invalid(Reason.TOO_FEW_STARS, mode="tracking")
-        observation = search.database.normalise(features)
-        cell, distance, _ = search.lost_in_space.nearest_in_region(
-            observation, predicted.ra_deg, predicted.dec_deg, side_deg
-        )
-        centres = _spots(predicted, side_deg)
-        if cell >= 0:
-            answer = search.lost_in_space.estimate(observation, cell, distance).mse
-            centres = np.concatenate([[[answer.right_ascension_deg, answer.declination_deg]], centres])
-        for attitude, _ in search.attitudes(chosen, centres):
-            if attitude is None:
+            return None, ()
+        field = search.field_stars(measured.xy, measured.flux, zero_point).only(known.true_stars)
+        seen = search.features(field)
+        if seen is None:
+            return field, ()
+        observations = search.doubtful_features(field) if self.options.refinement else [seen]
+        found = [search.answer_in_region(features, centre, side_deg) for features in observations]
+        answers = [answer for answer in found if answer is not None]
+        return field, (*answers[:1], *sorted(answers[1:], key=lambda answer: answer.error_psi))
+
+    def _accepted(
+        self,
+        measured: CheckedDetections,
+        known: Preprocessed,
+        field: FieldStars,
+        answers: tuple[FeatureAnswer, ...],
+    ) -> Solution | None:
+        """The solution of the first answer of the region that is good enough; None if there is none.
+
+        It is good enough if ε_ψ ≤ τ and, with refinement, if it is verified.
+        """
+        for answer in answers:
+            if answer.error_psi > self._settings.tau:
                 continue
-            solution = self.lsi.verify(measured, attitude, WINDOW_PX)
-            if solution.valid:
-                self.lsi.learn(solution, measured.flux)
-                return dataclasses.replace(solution, mode="tracking")
-        return Solution.invalid(Reason.NO_MATCH, mode="tracking")
+            if not self.options.refinement:
+                found = self.lsi.by_features_alone(answer, self._place_wrong(answer, known))
+                return dataclasses.replace(found, mode="tracking", features=report_of(answer, "rsi"))
+            for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
+                if attitude is None:
+                    continue
+                solution = self.lsi.verify(measured, attitude, WINDOW_PX)
+                if solution.valid:
+                    self.lsi.learn(solution, measured.flux)
+                    report = report_of(answer, "rsi", refined=True)
+                    return dataclasses.replace(solution, mode="tracking", features=report)
+        return None
 
 
-def _spots(predicted: Attitude, side_deg: float) -> Array:
-    """Boresights (k, 2) in degrees that cover the region, from the centre outwards."""
-    steps = math.ceil(0.5 * side_deg / _SPOT_DEG)
-    offsets = np.linspace(-0.5 * side_deg, 0.5 * side_deg, 2 * steps + 1)
-    east, north = (grid.ravel() for grid in np.meshgrid(offsets, offsets))
-    order = np.argsort(np.hypot(east, north), kind="stable")
-    slopes = np.tan(np.radians(np.column_stack([east, north])[order]))
-    rays = np.column_stack([slopes, np.ones(len(slopes))]) @ predicted.matrix
-    ra = np.degrees(np.arctan2(rays[:, 1], rays[:, 0])) % 360.0
-    return np.column_stack([ra, np.degrees(np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1])))])
+def _directions(positions_deg: Array) -> Array:
+    """Unit vectors (n, 3) of gnomonic positions in degrees."""
+    found = rays(positions_deg)
+    return np.asarray(found / np.linalg.norm(found, axis=1)[:, None], dtype=np.float64)

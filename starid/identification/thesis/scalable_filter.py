@@ -12,13 +12,15 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
 from starid.arrays import Array, Indices, Mask
+from starid.attitude.wahba import solve_wahba
 from starid.identification.thesis.cme import rigid_fit
 from starid.identification.thesis.false_stars import FilterError, FilterResult, ObservedFrame
+from starid.identification.thesis.frame_grid import Geometry
 from starid.identification.thesis.frame_motion import MAX_VOTERS, find_motion, nearest_objects
 
 MAX_OBJECTS: Final = 2000
@@ -29,11 +31,12 @@ _MIN_OBJECTS: Final = 2
 _MIN_SCORE: Final = 2.0
 _SCATTER_FRAMES: Final = 3
 _MIN_SPREAD: Final = 0.5
-_SUMS: Final = 11
+_SUMS: Final = 13
 _FADING: Final = 0.95
 _MOTION_NOISE: Final = 0.05
 _TRIM: Final = 2.2
-_STILL: Final = np.array([1.0, 0.0, 0.0, 0.0])
+_LEAST_DEPTH: Final = 1e-3
+"""Depth at which a direction behind the camera is put, so that its position is far outside the image."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +61,9 @@ class TrackFilterSettings:
     confirm
         Number of sightings that make an object a true star, once that many frames have been seen. Two are
         enough if all false stars are transient and positions are accurate; slow false stars need three.
+    geometry
+        "planar": a motion shifts and rotates positions, as in the plane of the thesis. "spherical": it rotates the
+        directions whose gnomonic positions they are, by which stars far from the centre move farther.
     """
 
     position_sigma_deg: float = 0.02
@@ -68,6 +74,7 @@ class TrackFilterSettings:
     evidence: float = 9.0
     history: int = 4
     confirm: int = 3
+    geometry: Geometry = "planar"
 
     def __post_init__(self) -> None:
         if not (self.position_sigma_deg > 0.0 and self.brightness_sigma > 0.0 and self.gate > 0.0):
@@ -87,7 +94,8 @@ class TrackResult:
     track
         Track number of each object, (n,), the same for a star in every frame.
     motion
-        Motion of the stars since the previous frame: cosine, sine, shift x, shift y (degrees); or None.
+        Motion of the stars since the previous frame, or None: cosine, sine, shift x, shift y (degrees) in the planar
+        geometry, a rotation matrix (3, 3) in the spherical one.
     """
 
     true_now: Mask
@@ -99,8 +107,8 @@ class TrackResult:
 class _Tracks:
     """Tracked objects: current position and magnitude, and sums over their observations for the scatter.
 
-    `sums` (n, 11) has, with fading weights, Σ1, Σt, Σt², then Σx, Σy, Σ(x² + y²), Σt·x, Σt·y in coordinates
-    that move with the stars, and Σu, Σv, Σ(u² + v²) in sensor coordinates.
+    `sums` (n, 13) has, with fading weights, Σ1, Σt, Σt², then Σx, Σy, Σz, Σ(x² + y² + z²), Σt·x, Σt·y, Σt·z in
+    coordinates that move with the stars, and Σu, Σv, Σ(u² + v²) in sensor coordinates.
     """
 
     number: Indices
@@ -135,6 +143,7 @@ class TrackFilter:
 
     def __init__(self, settings: TrackFilterSettings | None = None) -> None:
         self.settings = settings or TrackFilterSettings()
+        self._motions: _Motions = _Sphere() if self.settings.geometry == "spherical" else _Plane()
         self.reset()
 
     def reset(self) -> None:
@@ -143,8 +152,8 @@ class TrackFilter:
         self._last_result: TrackResult | None = None
         self._next_number = 0
         self._frame = 0
-        self._anchor = _STILL.copy()
-        self._last_motion = _STILL.copy()
+        self._anchor = self._motions.still
+        self._last_motion = self._motions.still
         self._tracks = self._new_tracks(np.empty((0, 2)), np.empty(0))
         self._suspect = np.empty(0, dtype=np.bool_)
 
@@ -185,9 +194,9 @@ class TrackFilter:
             self._tracks = self._tracks.joined(fresh) if len(frame) < _MIN_OBJECTS else fresh
             self._suspect = np.zeros(len(self._tracks), dtype=np.bool_)
             return TrackResult(np.zeros(len(frame), dtype=np.bool_), fresh.number, None)
-        partner = self._associate(positions, brightness, motion)
+        partner, motion = self._associate(positions, brightness, motion)
         self._last_motion = motion
-        self._anchor = _composed(motion, self._anchor)
+        self._anchor = self._motions.composed(motion, self._anchor)
         self._update_tracks(positions, brightness, partner, motion)
         wandering = self._fixed_or_drifting()
         genuine = (self._tracks.seen >= min(self.settings.confirm, self._frame)) & ~wandering
@@ -222,10 +231,11 @@ class TrackFilter:
         return tracks
 
     def _add_to_sums(self, sums: Array, which: Indices, positions: Array) -> None:
-        x, y = _moved_back(positions, self._anchor).T
+        x, y, z = self._motions.moved_back(positions, self._anchor).T
         u, v = positions.T
         t = np.full(x.size, float(self._frame))
-        terms = [np.ones_like(t), t, t * t, x, y, x * x + y * y, t * x, t * y, u, v, u * u + v * v]
+        square = x * x + y * y + z * z
+        terms = [np.ones_like(t), t, t * t, x, y, z, square, t * x, t * y, t * z, u, v, u * u + v * v]
         sums[which] += np.column_stack(terms)
 
     def _find_motion(self, positions: Array, brightness: Array) -> Array | None:
@@ -235,9 +245,9 @@ class TrackFilter:
             return None
         voters = np.lexsort((tracks.brightness, -np.minimum(tracks.seen, 2)))[:MAX_VOTERS]
         brightest = np.argsort(brightness, kind="stable")[:MAX_VOTERS]
-        motion = self._last_motion.copy()
+        known, change = self._motions.start(self._last_motion)
         score = find_motion(
-            tracks.position[voters],
+            self._motions.moved(tracks.position[voters], known),
             tracks.brightness[voters],
             positions[brightest],
             brightness[brightest],
@@ -245,18 +255,20 @@ class TrackFilter:
             settings.brightness_sigma,
             math.radians(settings.max_rotation_deg),
             settings.max_shift_deg,
-            motion,
+            change,
         )
-        return motion if score >= _MIN_SCORE else None
+        if score < _MIN_SCORE:
+            return None
+        return self._motions.composed(self._motions.of_plane(change), known)
 
-    def _associate(self, positions: Array, brightness: Array, motion: Array) -> Indices:
-        """Match tracks and objects, refining the motion in place; return the object of each track, or −1."""
+    def _associate(self, positions: Array, brightness: Array, motion: Array) -> tuple[Indices, Array]:
+        """Match tracks and objects; return the object of each track, or −1, and the refined motion."""
         tracks, settings = self._tracks, self.settings
         partner = np.empty(len(tracks), dtype=np.int64)
         trusted = (tracks.seen > 1) & ~self._suspect
         error = np.zeros(len(tracks))
         for turn in range(_REFITS):
-            predicted = _moved(tracks.position, motion)
+            predicted = self._motions.moved(tracks.position, motion)
             variance = tracks.variance + settings.position_sigma_deg**2
             nearest_objects(
                 positions,
@@ -272,22 +284,24 @@ class TrackFilter:
             if np.count_nonzero(chosen & trusted) > _MIN_OBJECTS:
                 chosen &= trusted
             objects = positions[np.maximum(partner, 0)]
-            if turn > 0:
+            if turn > 0 and chosen.any():
                 distance = np.hypot(*(objects - predicted).T) / np.sqrt(variance)
                 near = chosen & (distance <= _TRIM * max(float(np.median(distance[chosen])), 1.0))
                 chosen = near if np.count_nonzero(near) > _MIN_OBJECTS else chosen
-            if rigid_fit(tracks.position, objects, chosen, motion):
+            fitted = self._motions.fit(tracks.position, objects, chosen)
+            if fitted is not None:
+                motion = fitted
                 arm = np.sum((tracks.position - tracks.position[chosen].mean(axis=0)) ** 2, axis=1)
                 share = 1.0 / np.count_nonzero(chosen) + arm / max(float(arm[chosen].sum()), 1e-12)
                 error = settings.position_sigma_deg**2 * np.minimum(share, 1.0)
-        return partner
+        return partner, motion
 
     def _update_tracks(self, positions: Array, brightness: Array, partner: Indices, motion: Array) -> None:
         """Move all tracks with the stars and update the matched ones."""
         old, sigma2 = self._tracks, self.settings.position_sigma_deg**2
         which = np.flatnonzero(partner >= 0)
         objects = partner[which]
-        position = _moved(old.position, motion)
+        position = self._motions.moved(old.position, motion)
         variance = old.variance + _MOTION_NOISE * sigma2
         gain = variance[which] / (variance[which] + sigma2)
         position[which] += gain[:, None] * (positions[objects] - position[which])
@@ -312,12 +326,12 @@ class TrackFilter:
         old = np.flatnonzero(tracks.seen >= _SCATTER_FRAMES)
         if old.size <= _MIN_OBJECTS:
             return result
-        n, t, tt, x, y, xx, tx, ty, u, v, uu = tracks.sums[old].T
-        as_star = np.maximum(xx - (x * x + y * y) / n, 0.0)
+        n, t, tt, x, y, z, xx, tx, ty, tz, u, v, uu = tracks.sums[old].T
+        as_star = np.maximum(xx - (x * x + y * y + z * z) / n, 0.0)
         as_fixed = np.maximum(uu - (u * u + v * v) / n, 0.0)
         usual = max(self.settings.position_sigma_deg**2, float(np.median(as_star / (2.0 * n))))
         spread = np.maximum(tt - t * t / n, _MIN_SPREAD)
-        velocity = np.column_stack([tx - t * x / n, ty - t * y / n]) / spread[:, None]
+        velocity = np.column_stack([tx - t * x / n, ty - t * y / n, tz - t * z / n]) / spread[:, None]
         velocity -= np.median(velocity, axis=0)
         drift = np.sum(velocity**2, axis=1) * spread / usual
         drift /= max(1.0, float(np.median(drift)))
@@ -326,22 +340,104 @@ class TrackFilter:
         return result
 
 
-def _moved(positions: Array, motion: Array) -> Array:
-    c, s, x, y = motion
-    return np.column_stack(
-        [c * positions[:, 0] - s * positions[:, 1] + x, s * positions[:, 0] + c * positions[:, 1] + y]
-    )
+class _Motions(Protocol):
+    """How positions move from frame to frame; a motion is an array."""
+
+    still: Array
+
+    def start(self, last: Array) -> tuple[Array, Array]:
+        """From the last motion: one by which to move the objects first, and a guess of the rest near the centre, (4,)."""
+        ...
+
+    def of_plane(self, motion: Array) -> Array:
+        """The motion whose effect near the centre is a cosine, a sine and a shift in degrees, (4,)."""
+        ...
+
+    def moved(self, positions: Array, motion: Array) -> Array:
+        """Positions (n, 2), degrees, after a motion."""
+        ...
+
+    def moved_back(self, positions: Array, motion: Array) -> Array:
+        """Coordinates (n, 3), degrees, in which objects that have taken part in the motion are at rest."""
+        ...
+
+    def composed(self, second: Array, first: Array) -> Array:
+        """`first` followed by `second`."""
+        ...
+
+    def fit(self, before: Array, now: Array, chosen: Mask) -> Array | None:
+        """The motion of the chosen objects by least squares; None if there are fewer than two."""
+        ...
 
 
-def _moved_back(positions: Array, motion: Array) -> Array:
-    c, s, x, y = motion
-    u, v = positions[:, 0] - x, positions[:, 1] - y
-    return np.column_stack([c * u + s * v, c * v - s * u])
+class _Plane:
+    """Rigid motions of the plane: cosine, sine, shift x, shift y (degrees)."""
+
+    still = np.array([1.0, 0.0, 0.0, 0.0])
+
+    def start(self, last: Array) -> tuple[Array, Array]:
+        return self.still, last.copy()
+
+    def of_plane(self, motion: Array) -> Array:
+        return motion
+
+    def moved(self, positions: Array, motion: Array) -> Array:
+        c, s, x, y = motion
+        return np.column_stack(
+            [c * positions[:, 0] - s * positions[:, 1] + x, s * positions[:, 0] + c * positions[:, 1] + y]
+        )
+
+    def moved_back(self, positions: Array, motion: Array) -> Array:
+        c, s, x, y = motion
+        u, v = positions[:, 0] - x, positions[:, 1] - y
+        return np.column_stack([c * u + s * v, c * v - s * u, np.zeros(len(u))])
+
+    def composed(self, second: Array, first: Array) -> Array:
+        c, s = second[0] * first[0] - second[1] * first[1], second[1] * first[0] + second[0] * first[1]
+        x = second[0] * first[2] - second[1] * first[3] + second[2]
+        y = second[1] * first[2] + second[0] * first[3] + second[3]
+        return np.array([c, s, x, y])
+
+    def fit(self, before: Array, now: Array, chosen: Mask) -> Array | None:
+        motion = np.empty(4)
+        return motion if rigid_fit(before, now, chosen, motion) else None
 
 
-def _composed(second: Array, first: Array) -> Array:
-    """Compose two motions: `first` followed by `second`."""
-    c, s = second[0] * first[0] - second[1] * first[1], second[1] * first[0] + second[0] * first[1]
-    x = second[0] * first[2] - second[1] * first[3] + second[2]
-    y = second[1] * first[2] + second[0] * first[3] + second[3]
-    return np.array([c, s, x, y])
+class _Sphere:
+    """Rotations of directions, (3, 3); positions are gnomonic, degrees."""
+
+    still = np.identity(3)
+
+    def start(self, last: Array) -> tuple[Array, Array]:
+        return last, np.array([1.0, 0.0, 0.0, 0.0])
+
+    def of_plane(self, motion: Array) -> Array:
+        c, s, x, y = motion
+        centre = rays(np.array([[x, y]]))[0]
+        centre /= np.linalg.norm(centre)
+        right = np.array([1.0, 0.0, 0.0]) - centre[0] * centre
+        right /= np.linalg.norm(right)
+        tilt = np.column_stack([right, np.cross(centre, right), centre])
+        return np.asarray(tilt @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), dtype=np.float64)
+
+    def moved(self, positions: Array, motion: Array) -> Array:
+        turned = rays(positions) @ motion.T
+        return np.degrees(turned[:, :2] / np.maximum(turned[:, 2:], _LEAST_DEPTH))
+
+    def moved_back(self, positions: Array, motion: Array) -> Array:
+        directions = rays(positions)
+        directions /= np.linalg.norm(directions, axis=1)[:, None]
+        return np.degrees(directions @ motion)
+
+    def composed(self, second: Array, first: Array) -> Array:
+        return np.asarray(second @ first, dtype=np.float64)
+
+    def fit(self, before: Array, now: Array, chosen: Mask) -> Array | None:
+        if np.count_nonzero(chosen) < _MIN_OBJECTS:
+            return None
+        return solve_wahba(rays(now[chosen]), rays(before[chosen])).matrix
+
+
+def rays(positions_deg: Array) -> Array:
+    """Directions (n, 3) of gnomonic positions in degrees, not of unit length."""
+    return np.column_stack([np.radians(positions_deg), np.ones(len(positions_deg))])

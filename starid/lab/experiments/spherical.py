@@ -33,7 +33,7 @@ _COLUMNS: Final = (
 def _identifier(name: str) -> Any:
     from starid.identification.star_identifier import make_identifier
 
-    identifier: Any = make_identifier(name)
+    identifier: Any = make_identifier(name, zero_point=_ZERO_POINT, detected_limit=_LIMIT)
     identifier.warm_up()
     return identifier
 

@@ -205,3 +205,35 @@ def test_an_affine_motion_needs_three_stars_in_a_triangle(before):
 def test_an_unknown_model_of_motion_is_rejected():
     with pytest.raises(FilterError, match="model must be rigid or affine"):
         estimate_motion(np.eye(2), np.eye(2), model="projective")
+
+
+def sky_in_motion(rng, rate_deg, frames):
+    """Gnomonic positions, degrees, and magnitudes of the stars of a field of 42° that turns about x; all are true."""
+    directions = rng.normal(size=(3000, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    brightness = rng.uniform(0.0, 5.0, len(directions))
+    for i in range(frames):
+        angle = np.radians(rate_deg * i)
+        turn = np.array(
+            [
+                [1.0, 0.0, 0.0],
+                [0.0, np.cos(angle), -np.sin(angle)],
+                [0.0, np.sin(angle), np.cos(angle)],
+            ]
+        )
+        seen = directions @ turn.T
+        inside = seen[:, 2] > np.cos(np.radians(RADIUS))
+        places = np.degrees(seen[inside, :2] / seen[inside, 2:]) + rng.normal(0.0, 0.01, (inside.sum(), 2))
+        yield ObservedFrame(brightness[inside], places)
+
+
+def test_stars_far_from_the_centre_of_a_turning_sphere_are_true():
+    removed, removed_in_plane = [], []
+    for geometry, counts in (("spherical", removed), ("planar", removed_in_plane)):
+        settings = TrackFilterSettings(position_sigma_deg=0.02, max_shift_deg=3.0, geometry=geometry)
+        track = TrackFilter(settings)
+        frames = list(sky_in_motion(np.random.default_rng(12), 0.5, 15))
+        results = [track.update(frame) for frame in frames]
+        counts += [float(np.mean(~result.true_now)) for result in results[5:]]
+    assert max(removed) < 0.12  # those that have just come into the field
+    assert np.mean(removed_in_plane) > 2.0 * np.mean(removed)

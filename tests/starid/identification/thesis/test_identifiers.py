@@ -83,7 +83,7 @@ def test_five_missing_stars_of_the_brightest_need_no_divided_field():
         if solution.valid:
             valid += 1
             assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
-    assert valid >= 19
+    assert valid >= 17
 
 
 @pytest.mark.parametrize(("ra", "dec"), [(0.0, 90.0), (123.0, -90.0), (0.01, 0.0), (359.99, 45.0)])
@@ -116,7 +116,7 @@ def test_rsi_follows_a_turning_sensor_among_false_stars():
     attitude = random_attitude(rng)
     for i in range(25):
         attitude = propagate(attitude, np.radians([0.3, 0.4, 0.2]), 1.0)
-        solution = tracker.update(*points(rng, attitude, false_stars=15), float(i))
+        solution = tracker.update(*points(rng, attitude, magnitude_sigma=0.03, false_stars=15), float(i))
         if i > 0:
             assert solution.valid
             assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
