@@ -1,7 +1,7 @@
 """The RSI algorithm for a real sensor (algorithm 3 of the thesis): filter, motion, region of search, and LSI.
 
 The false-star filter (FSF) compares each image with those before it. The motion of its true stars (CME) carries the last
-attitude to the present image; the cells of a region around it (eq. 6.5) are searched for the features of the true
+attitude to the present image; the cells of a region around it are searched for the features of the true
 stars. If ε_ψ > τ, the whole database is searched as well, and the answer with the smaller ε_ψ is kept; one with
 ε_ψ > K·τ is invalid. With refinement, an answer that is not verified counts as one with ε_ψ > τ.
 """
@@ -103,7 +103,7 @@ class Preprocessed:
     rotation_deg, translation_deg
         The same as rotation γ̃ about the boresight and length of the translation ρ̃, degrees; 0 if unknown.
     side_deg
-        Side of the region of search, eq. 6.5, degrees.
+        Side of the region of search (`rsi.py`), degrees.
     """
 
     true_stars: Mask
