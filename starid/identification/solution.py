@@ -7,14 +7,16 @@ import time
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
-from typing import Final, Literal, Self
+from typing import TYPE_CHECKING, Final, Literal, Self
 
 import numpy as np
 
 from starid.arrays import Array, Indices, Indices32
 from starid.attitude import ARCSEC_PER_RAD, Attitude
-from starid.camera import Camera
 from starid.errors import StaridError
+
+if TYPE_CHECKING:  # the process that answers the bus loads no kernels
+    from starid.camera import Camera
 
 Mode = Literal["lost_in_space", "tracking"]
 Five = tuple[float, float, float, float, float]
