@@ -19,6 +19,7 @@ if machine not in os.environ["BOOTS"].split():
 if "--check" not in sys.argv:
     print("ran in", machine, "with kernels for", os.environ.get("NUMBA_CPU_NAME", "this processor"))
 """
+SETTINGS = ("NUMBA_CPU_NAME", "REQUIRE_VCAN0")  # of the script: a test states those that it is about
 NO_GUEST = "no guest: uml: uml: ptrace set fp regs failed; qemu: qemu: ptrace set fp regs failed"
 
 
@@ -42,7 +43,7 @@ def run(tmp_path):
 
     def run(boots: str, packages: int = 0, **more: str) -> tuple[int, str]:
         environment = {
-            **{name: value for name, value in os.environ.items() if name != "NUMBA_CPU_NAME"},
+            **{name: value for name, value in os.environ.items() if name not in SETTINGS},
             "PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}",
             "BOOTS": boots,
             "PACKAGES": str(packages),
