@@ -184,7 +184,11 @@ class FrameMaker:
             return result.solution, len(result.detections.flux), begun
         found = detect(image, self.settings)
         detected = time.perf_counter()
-        return self.identifier.identify(found.xy_px, found.flux, found.sigma_px), len(found.flux), detected
+        return (
+            self.identifier.identify(found.xy_px, found.flux, found.position_errors),
+            len(found.flux),
+            detected,
+        )
 
 
 def error_of(answer: Solution, truth: Attitude) -> tuple[float, float, float]:

@@ -423,12 +423,25 @@ def _free_to_all(estimate: Sequence[str], values: Array) -> Array:
     return np.column_stack(columns)
 
 
-def attitude_covariance(camera: Camera, covariance: Array, xy_px: Array, sigma_px: Array) -> Array:
-    """Covariance (3, 3) of an attitude that errors of the camera's calibration cause, rad², sensor frame.
+def attitude_covariance(
+    camera: Camera,
+    covariance: Array,
+    xy_px: Array,
+    errors_px: Array,
+    offset_px: Array,
+    known_freedom: float,
+) -> tuple[Array, float]:
+    """Covariance (3, 3) of a least-squares attitude, rad², sensor frame, and noise of a star's position, pixels.
 
     An error p of the camera displaces the stars by Kᵢ p, which turns the attitude that fits them best by
-    ``G p = (Σ wᵢ RᵢᵀRᵢ)⁻¹ Σ wᵢ RᵢᵀKᵢ p`` to first order; R and K are the derivatives of a star's position with
-    respect to rotation and camera, and wᵢ = 1/σᵢ². The covariance is ``G C Gᵀ``. It has no part of the stars' noise.
+    ``G p = (Σ RᵢᵀWᵢRᵢ)⁻¹ Σ RᵢᵀWᵢKᵢ p`` to first order; R and K are the derivatives of a star's position with respect to
+    rotation and camera, and Wᵢ is the inverse covariance of its noise. The covariance of the attitude is
+    ``s² (Σ RᵢᵀWᵢRᵢ)⁻¹ + G C Gᵀ``.
+
+    The factor s² comes from the stars' distances from their predicted positions, without what errors of the camera
+    explain: the mean square of the distances after subtracting the likeliest p, plus pᵀC⁻¹p. Distances that the camera
+    causes would otherwise count as noise of the stars, which turns an image more easily than an error of its focal length.
+    With ν degrees of freedom s² is multiplied by ν/(ν − 2), as the posterior of the attitude is Student's.
 
     Parameters
     ----------
@@ -438,16 +451,45 @@ def attitude_covariance(camera: Camera, covariance: Array, xy_px: Array, sigma_p
         Covariance C of its parameters, as in `Calibration`.
     xy_px : ndarray (n, 2)
         Positions of the stars from which the attitude was computed; n ≥ 2.
-    sigma_px : ndarray (n,)
-        Standard deviation of each position per axis, pixels.
+    errors_px : ndarray (n,), (n, 2) or (n, 2, 2)
+        Standard deviation of each position, per star or per axis, pixels, or its covariance, pixels².
+    offset_px : ndarray (n, 2)
+        Positions minus those predicted by the attitude.
+    known_freedom : float
+        Weight of these errors in s², as a number of degrees of freedom for s² = 1.
     """
+    count = len(xy_px)
     vectors = camera.back_project(xy_px)
-    rotation = _rotation_jacobian(camera.params, vectors)
-    weighted = rotation.transpose(0, 2, 1) / np.square(sigma_px)[:, None, None]
-    by_camera = np.sum(weighted @ _camera_jacobian(camera.params, vectors), axis=0)
-    turn = np.linalg.solve(np.sum(weighted @ rotation, axis=0), by_camera)
-    result: Array = turn @ covariance @ turn.T
-    return result
+    errors = _error_matrices(errors_px)
+    whiten = np.linalg.inv(np.linalg.cholesky(errors))
+    rotation = (whiten @ _rotation_jacobian(camera.params, vectors)).reshape(2 * count, 3)
+    displaced = (whiten @ _camera_jacobian(camera.params, vectors) @ _root(covariance)).reshape(2 * count, 9)
+    offset = (whiten @ offset_px[:, :, None]).reshape(2 * count)
+    inverse = np.linalg.inv(rotation.T @ rotation)
+    turn = inverse @ rotation.T @ displaced
+    left, displaced = offset - rotation @ (inverse @ (rotation.T @ offset)), displaced - rotation @ turn
+    shift = np.linalg.solve(np.eye(9) + displaced.T @ displaced, displaced.T @ left)
+    freedom = 2.0 * count - 3.0 + known_freedom
+    unit = (known_freedom + float(left @ left - left @ displaced @ shift)) / freedom
+    student = freedom / (freedom - 2.0) if freedom > 2.0 else 1.0
+    noise_px = math.sqrt(unit * float(np.mean(np.einsum("nii->n", errors))) / 2.0)
+    return np.asarray(unit * student * inverse + turn @ turn.T), noise_px
+
+
+def _error_matrices(errors_px: Array) -> Array:
+    """Return covariances (n, 2, 2) of positions; see `attitude_covariance`."""
+    if errors_px.ndim == 3:
+        return errors_px
+    sigmas = np.broadcast_to(errors_px.reshape(len(errors_px), -1), (len(errors_px), 2))
+    return np.asarray(sigmas[:, :, None] ** 2 * np.eye(2))
+
+
+def _root(covariance: Array) -> Array:
+    """Return a matrix L (9, 9) with L Lᵀ = covariance, which may be singular and of any scale."""
+    scale = np.sqrt(np.diag(covariance))
+    scale[scale == 0.0] = 1.0
+    values, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
+    return np.asarray(scale[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _rotation_jacobian(params: Array, vectors: Array) -> Array:

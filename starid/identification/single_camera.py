@@ -45,7 +45,9 @@ def _is_finite(array: Array, magnitude: float) -> bool:
 def checked_detections(
     xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None
 ) -> tuple[Array, Array, Array]:
-    """Check detections; return contiguous positions (n, 2), flux (n,) and errors (n, 2), by default ones.
+    """Check detections; return contiguous positions (n, 2), flux (n,) and errors (n, 3), by default ones.
+
+    The errors are as in `CheckedDetections`.
 
     Raises
     ------
@@ -64,17 +66,30 @@ def checked_detections(
         raise StaridError("detections: positions and flux must be finite numbers")
     if extent > FARTHEST_PX and float(np.abs(xy).max()) > FARTHEST_PX:
         raise StaridError(f"detections: every position must lie within ±{FARTHEST_PX:g} pixels")
-    sigmas = np.ones(xy.shape)
+    sigmas = np.ones((len(xy), 3))
+    sigmas[:, 2] = 0.0
     if xy_sigma_px is not None:
         given = _numbers(xy_sigma_px, "position errors")
-        if given.shape not in {(len(xy),), xy.shape}:
+        if given.shape not in {(len(xy),), xy.shape, (len(xy), 2, 2)}:
             raise StaridError(
-                f"detections: shape of the errors of {len(xy)} positions must be (n,) or (n, 2), not {given.shape}"
+                f"detections: shape of the errors of {len(xy)} positions must be (n,), (n, 2) or (n, 2, 2), not {given.shape}"
             )
-        sigmas[:] = given if given.ndim == 2 else given[:, None]
-        if not (np.isfinite(sigmas).all() and (sigmas > 0.0).all()):
+        if given.ndim == 3:
+            sigmas[:] = _principal_axes(given)
+        else:
+            sigmas[:, :2] = given if given.ndim == 2 else given[:, None]
+        if not (np.isfinite(sigmas).all() and (sigmas[:, :2] > 0.0).all()):
             raise StaridError("detections: every position error must be finite and positive")
     return xy, brightness, sigmas
+
+
+def _principal_axes(covariance: Array) -> Array:
+    """Return errors (n, 3), as in `CheckedDetections`, of covariances (n, 2, 2); NaN if one is not positive definite."""
+    xx, yy, xy = covariance[:, 0, 0], covariance[:, 1, 1], 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
+    middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    with np.errstate(invalid="ignore"):
+        sigmas = np.sqrt(np.column_stack([middle + half, middle - half]))
+    return np.column_stack([sigmas, 0.5 * np.arctan2(2.0 * xy, xx - yy)])
 
 
 class CheckedDetections(NamedTuple):
@@ -86,8 +101,9 @@ class CheckedDetections(NamedTuple):
         Positions, pixels.
     flux : ndarray (n,)
         Flux in any linear unit.
-    sigmas : ndarray (n, 2)
-        One-sigma errors of the positions, pixels; ones if none were given.
+    sigmas : ndarray (n, 3)
+        One-sigma errors of the positions along two perpendicular axes, pixels, and the angle from +x to the first axis,
+        radians; ones along x and y if none were given.
     sigmas_known : bool
         Whether errors were given.
     observer_velocity : array (3,), optional
@@ -102,8 +118,17 @@ class CheckedDetections(NamedTuple):
 
     @property
     def given_sigmas(self) -> Array | None:
-        """The errors, or None if none were given."""
-        return self.sigmas if self.sigmas_known else None
+        """The errors as given to an identifier, (n, 2) or (n, 2, 2); None if none were given."""
+        if not self.sigmas_known:
+            return None
+        first, second, angle = self.sigmas.T
+        if not angle.any():
+            return np.ascontiguousarray(self.sigmas[:, :2])
+        axes = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=1).reshape(
+            -1, 2, 2
+        )
+        variances = np.column_stack([first, second])[:, :, None] ** 2
+        return np.asarray(axes.transpose(0, 2, 1) @ (variances * axes))
 
     @classmethod
     def of(

@@ -52,8 +52,8 @@ class StarIdentifier(Protocol):
             Positions, pixels.
         flux : array (n,)
             Flux in any linear unit.
-        xy_sigma_px : array (n,) or (n, 2), optional
-            One-sigma error of each position, per star or per axis, pixels; by default estimated.
+        xy_sigma_px : array (n,), (n, 2) or (n, 2, 2), optional
+            One-sigma error of each position, per star or per axis, pixels, or its covariance, pixels²; by default estimated.
         observer_velocity : array (3,), optional
             Velocity of the camera relative to the barycentre of the solar system, ICRS, m/s. The attitude is
             then corrected for aberration (`starid.catalog.aberration`). By default it is not.

@@ -34,8 +34,8 @@ class Fit(Protocol):
         Position, image pixels.
     flux : float
         Light, counts.
-    var_x, var_y, var_flux : float
-        Their variances, pixels² and counts².
+    var_x, var_y, cov_xy, var_flux : float
+        Their variances, and the covariance of x and y, pixels² and counts².
     chi2, pixels : float
         Weighted sum of squares, and over how many pixels.
     state : int
@@ -47,6 +47,7 @@ class Fit(Protocol):
     flux: float
     var_x: float
     var_y: float
+    cov_xy: float
     var_flux: float
     chi2: float
     pixels: float
@@ -286,6 +287,7 @@ def fit_star(
             result.flux = flux + step_f
             result.var_x = c_xx * scale
             result.var_y = c_yy * scale
+            result.cov_xy = c_xy * scale
             result.var_flux = c_ff * scale
             result.chi2 = sums[9]
             result.pixels = sums[10]

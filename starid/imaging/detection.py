@@ -49,6 +49,7 @@ from starid.imaging.spot_shape import (
 )
 from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
+from starid.imaging.trail_flow import trail_shifts
 from starid.imaging.windows import (
     MIN_SPREAD_PX,
     SEEN_BEFORE,
@@ -78,6 +79,11 @@ _OTHER_WIDTH: Final = 0.3
 _MISFIT_SIGMA: Final = 3.0
 _RELAX: Final = 0.8
 _MAX_NEIGHBOURS: Final = 64
+_TRAIL_ERROR: Final = 4e-4
+"""Error along a trail, as a share of its length, that its model leaves."""
+
+_CUT_TRAIL_ERROR: Final = 0.01
+"""The same, also across, of a trail that the image's edge cuts off: its length and direction are known only from other stars."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +161,8 @@ class Detections:
         Flux and its one-sigma error, in electrons if the gain is given, else in counts.
     xy_sigma_px : ndarray (n, 2)
         One-sigma errors of the position along x and y, pixels.
+    correlation : ndarray (n,)
+        Correlation of these errors: along a trail they are larger than across it.
     saturated, edge : ndarray (n,) of bool
         The star has saturated pixels; its light is cut off by the edge of the image.
     background, noise : float
@@ -175,6 +183,7 @@ class Detections:
     flux: Array
     flux_sigma: Array
     xy_sigma_px: Array
+    correlation: Array
     saturated: Mask
     edge: Mask
     background: float
@@ -189,6 +198,16 @@ class Detections:
     def sigma_px(self) -> Array:
         """Errors (n,) of the position, root mean square of both axes."""
         return np.asarray(np.sqrt(np.mean(self.xy_sigma_px**2, axis=1)), dtype=np.float64)
+
+    @property
+    def position_errors(self) -> Array:
+        """Errors for an identifier: `sigma_px` (n,) of round stars, covariances (n, 2, 2) of trails, pixels²."""
+        if self.trail_px == 0.0:
+            return self.sigma_px
+        covariance = self.xy_sigma_px[:, :, None] * self.xy_sigma_px[:, None, :]
+        covariance[:, 0, 1] *= self.correlation
+        covariance[:, 1, 0] *= self.correlation
+        return covariance
 
     def __len__(self) -> int:
         """Return the number of stars."""
@@ -330,7 +349,7 @@ def _no_detections(background: Background, reason: str, rejected: int = 0) -> De
     pairs = np.zeros((0, 2))
     no = np.zeros(0, dtype=bool)
     level, noise = background.median_level, background.median_noise
-    return Detections(pairs, none, none, pairs, no, no, level, noise, 0.0, 0.0, rejected, reason)
+    return Detections(pairs, none, none, pairs, none, no, no, level, noise, 0.0, 0.0, rejected, reason)
 
 
 def _peaks(scene: _Scene, sigma_px: float) -> tuple[Indices32, Grid]:
@@ -513,15 +532,26 @@ def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detecti
     good = good[np.argsort(-fits.stars["flux"][good], kind="stable")][: settings.max_stars]
     stars, marks = fits.stars[good], fits.flags[good]
     misfit, is_bad = _misfits(stars)
-    for variance in ("var_x", "var_y", "var_flux"):
+    for variance in ("var_x", "var_y", "cov_xy", "var_flux"):
         stars[variance] *= np.where(is_bad, misfit, 1.0)
     doubt_close_pairs(stars, np.argsort(-stars["y"], kind="stable"), settings.blend_px)
     unit = 1.0 if settings.gain_e_per_dn is None else settings.gain_e_per_dn
+    middle = np.column_stack([stars["x"], stars["y"]])
+    if shape.trail_px > 0.0:
+        size = (scene.counts.shape[1], scene.counts.shape[0])
+        shifts, trails = trail_shifts(shape.flow, middle, size, shape.sigma_px, shape.trail_px)
+        middle -= shifts
+        cut = np.where(marks & AT_EDGE, _CUT_TRAIL_ERROR, 0.0) ** 2 * np.sum(trails**2, axis=1)
+        stars["var_x"] += (_TRAIL_ERROR * trails[:, 0]) ** 2 + cut
+        stars["var_y"] += (_TRAIL_ERROR * trails[:, 1]) ** 2 + cut
+        stars["cov_xy"] += _TRAIL_ERROR**2 * trails[:, 0] * trails[:, 1]
+    sigmas = np.sqrt(np.column_stack([stars["var_x"], stars["var_y"]]))
     return Detections(
-        np.column_stack([stars["x"], stars["y"]]),
+        middle,
         stars["flux"] * unit,
         np.sqrt(stars["var_flux"]) * unit,
-        np.sqrt(np.column_stack([stars["var_x"], stars["var_y"]])),
+        sigmas,
+        stars["cov_xy"] / (sigmas[:, 0] * sigmas[:, 1]),
         (marks & SATURATED) != 0,
         (marks & AT_EDGE) != 0,
         background.median_level,

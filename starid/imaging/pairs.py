@@ -149,6 +149,7 @@ def fit_pair(
             pair[star].flux = flux + min(max(change, -_MAX_CHANGE * flux), max(flux, -change))
             pair[star].var_x = inverse[3 * star, 3 * star]
             pair[star].var_y = inverse[3 * star + 1, 3 * star + 1]
+            pair[star].cov_xy = inverse[3 * star, 3 * star + 1]
             pair[star].var_flux = inverse[3 * star + 2, 3 * star + 2]
             pair[star].chi2 = chi2
             pair[star].pixels = used
@@ -235,7 +236,7 @@ def doubt_close_pairs(stars: Records, order: Indices, blend_px: float) -> None:
     Parameters
     ----------
     stars : ndarray (n,) of FIT
-        `var_x` and `var_y` grow.
+        `var_x` and `var_y` grow, and with them `cov_xy`.
     order : ndarray (n,)
         Indices of the stars, sorted by decreasing `y`.
     blend_px : float
@@ -257,6 +258,7 @@ def doubt_close_pairs(stars: Records, order: Indices, blend_px: float) -> None:
             shift = _blend_shift(off_x, off_y, ratio, blend_px)
             brighter.var_x += (shift * off_x) ** 2
             brighter.var_y += (shift * off_y) ** 2
+            brighter.cov_xy += shift * shift * off_x * off_y
 
 
 @compiled_ieee

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.imaging.normal_table import normal
 from starid.kernels.jit import compiled_ieee
 from starid.kernels.small_arrays import copy_values, median
 
@@ -29,6 +30,8 @@ _CLIP: Final = 3.0
 _MIN_CLIP_PX: Final = 0.1
 _ROUNDS: Final = 4
 _SINGULAR: Final = 1e-12
+_SHARE_STEP: Final = 0.1
+_SHARE_REACH: Final = 6.0
 
 
 @compiled_ieee
@@ -53,6 +56,66 @@ def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[
     """
     half = 0.5 * max(width, height)
     return _flow_trail(flow, (x - 0.5 * (width - 1)) / half, (y - 0.5 * (height - 1)) / half)
+
+
+@compiled_ieee
+def _shares(length: float) -> tuple[float, float]:
+    """Shift of the fitted spot along a trail and across it, as a share of the acceleration a in p + d·t + a·t²/2, −½ < t < ½.
+
+    The light at time t lies a·t²/2 off, and least squares find the shifts ``a ∫ M' P' / ∫ M'²`` along and ``a ∫ M P / ∫ M²``
+    across, where M is the light along the uniform trail and P that weighted with t²/2. Short trails shift with the mean of
+    the light, by 1/24, long ones along it with their ends, by 1/8. `length` is in standard deviations of the spot.
+    """
+    along = slopes = across = lights = 0.0
+    for k in range(math.ceil((0.5 * length + _SHARE_REACH) / _SHARE_STEP)):
+        x = (k + 0.5) * _SHARE_STEP
+        ahead, ahead_bell = normal(x + 0.5 * length)
+        behind, behind_bell = normal(x - 0.5 * length)
+        light, slope = ahead - behind, ahead_bell - behind_bell
+        tilt = (x + 0.5 * length) * ahead_bell - (x - 0.5 * length) * behind_bell
+        along += slope * (x * light + slope)
+        slopes += slope * slope
+        across += light * ((x * x + 1.0) * light + 2.0 * x * slope - tilt)
+        lights += light * light
+    square = length * length
+    return 0.125 + along / (square * slopes), 0.5 * across / (square * lights)
+
+
+def trail_shifts(
+    flow: Array, positions: Array, size: tuple[int, int], sigma_px: float, trail_px: float
+) -> tuple[Array, Array]:
+    """Shifts (n, 2), pixels, of straight, uniform trails that are fitted to trails from where the stars were at mid-exposure.
+
+    The trails (n, 2) are returned too.
+
+    A trail is curved, and faster at one end: with the trail d(p) at a position p the path is p + d·t + (∇d)d·t²/2,
+    −½ < t < ½. Across the trail the fit follows the mean of the light, along it more and more its ends.
+
+    Parameters
+    ----------
+    flow : ndarray (5,)
+        As in `trail_at`.
+    positions : ndarray (n, 2)
+        Pixels.
+    size : (int, int)
+        Columns and rows of the image.
+    sigma_px, trail_px : float
+        Standard deviation of the spot, and typical length of the trails.
+    """
+    half = 0.5 * max(size)
+    u, v = ((positions - 0.5 * np.array([size[0] - 1, size[1] - 1])) / half).T
+    inward = flow[3] * u + flow[4] * v
+    dx = flow[0] + u * inward - flow[2] * v
+    dy = flow[1] + v * inward + flow[2] * u
+    change = flow[3] * dx + flow[4] * dy
+    trail = np.column_stack([dx, dy])
+    curve = (
+        np.column_stack([dx * inward + u * change - flow[2] * dy, dy * inward + v * change + flow[2] * dx])
+        / half
+    )
+    share_along, share_across = _shares(trail_px / sigma_px)
+    along = np.sum(curve * trail, axis=1) / np.maximum(np.sum(trail * trail, axis=1), _SINGULAR)
+    return share_across * curve + (share_along - share_across) * along[:, None] * trail, trail
 
 
 @compiled_ieee

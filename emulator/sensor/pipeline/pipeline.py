@@ -52,6 +52,7 @@ from starid.camera.calibration import attitude_covariance
 from starid.catalog import load_catalog
 from starid.catalog.aberration import aberrated
 from starid.errors import StaridError
+from starid.identification.geometric.refinement import PRIOR_FREEDOM
 from starid.identification.solution import Reason, Solution
 from starid.identification.star_identifier import StarIdentifier
 from starid.imaging.detection import Detections, DetectionSettings, detect
@@ -274,22 +275,24 @@ class Pipeline:
         settings = request.settings
         chosen = slice(0, settings.max_stars_matched if self._setup.algorithm == "geometric" else None)
         xy, flux = found.xy_px[chosen], found.flux[chosen] / request.exposure_s
-        sigma = np.sqrt(np.mean(found.xy_sigma_px[chosen] ** 2, axis=1))
+        errors = found.position_errors[chosen]
         if request.predicted is None:
-            solution = identifier.identify(xy, flux, sigma, observer_velocity=request.observer_velocity)
+            solution = identifier.identify(xy, flux, errors, observer_velocity=request.observer_velocity)
         else:
             windows_px = (settings.search_width / 2.0, settings.window_width / 2.0)
             solution = identifier.track(
                 xy,
                 flux,
                 np.array(request.predicted.quaternion_xyzw),
-                sigma,
+                errors,
                 window_px=float(min(settings.tracking_margin, *windows_px)),
                 observer_velocity=request.observer_velocity,
             )
         if not solution.valid or (solution.features is not None and not solution.features.refined):
             return solution
-        if _within_margin(identifier, solution, xy, request) < settings.min_stars_matched:
+        offsets = _offsets(identifier, solution, xy, request)
+        within = np.hypot(*offsets.T) <= settings.validation_margin
+        if np.count_nonzero(within) < settings.min_stars_matched:
             reason = (
                 Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
             )
@@ -298,8 +301,10 @@ class Pipeline:
         if self._calibration is None:
             return solution
         camera, used = calibrated_camera(self.camera, settings), solution.detection_index
-        known = attitude_covariance(camera, self._calibration, xy[used], sigma[used])
-        return replace(solution, covariance=solution.covariance + known)
+        covariance, noise_px = attitude_covariance(
+            camera, self._calibration, xy[used], errors[used], offsets, PRIOR_FREEDOM
+        )
+        return replace(solution, covariance=covariance, sigma_px=noise_px)
 
     def _identifier_setup(self, request: FrameRequest | IndexRequest) -> StarIdentifierSetup:
         """Return the setup of the star identifier for the parameters and the calibrated camera."""
@@ -400,14 +405,13 @@ class Pipeline:
         return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
 
 
-def _within_margin(identifier: StarIdentifier, solution: Solution, xy: Array, request: FrameRequest) -> int:
-    """Count the matched stars within the validation margin of their expected position."""
+def _offsets(identifier: StarIdentifier, solution: Solution, xy: Array, request: FrameRequest) -> Array:
+    """Return the distances (m, 2) of the matched stars from their expected positions, pixels."""
     icrs = identifier.catalog.vectors[solution.catalog_index]
     if request.observer_velocity is not None:
         icrs = aberrated(icrs, request.observer_velocity)
     expected_xy, _ = _camera_of(solution, identifier).project(solution.attitude.to_sensor(icrs))
-    offset_px = np.hypot(*(expected_xy - xy[solution.detection_index]).T)
-    return int(np.count_nonzero(offset_px <= request.settings.validation_margin))
+    return np.asarray(xy[solution.detection_index] - expected_xy)
 
 
 def _camera_of(solution: Solution, identifier: StarIdentifier) -> Camera:

@@ -50,7 +50,7 @@ def to_sky(rotation: Array, seen: Table, i: int) -> tuple[float, float, float]:
 def residual(
     star_table: Array, seen: Table, rotation: Array, i: int, star: int
 ) -> tuple[float, float, float, float, float]:
-    """Residual of detection i (column, row; pixels), and the star's direction in the sensor frame."""
+    """Residual of detection i along the axes of its error, pixels, and the star's direction in the sensor frame."""
     a, b, c = star_table[star, 0], star_table[star, 1], star_table[star, 2]
     x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c
     y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c

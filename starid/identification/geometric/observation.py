@@ -36,21 +36,21 @@ Z: Final = 2
 U_X: Final = 3
 U_Y: Final = 4
 U_Z: Final = 5
-"""Derivative of the column with respect to direction, pixels per unit."""
+"""Derivative of the position along the first axis of its error with respect to direction, pixels per unit."""
 V_X: Final = 6
 V_Y: Final = 7
 V_Z: Final = 8
-"""Derivative of the row with respect to direction, pixels per unit."""
+"""The same along the second axis. The axes are column and row, or those of an elongated error ellipse."""
 MAGNITUDE: Final = 9
 """−2.5·log10(flux)."""
 SIGMA_U: Final = 10
 SIGMA_V: Final = 11
-"""One-sigma errors of column and row, in pixels or, if only relative errors are known, in arbitrary units."""
+"""One-sigma errors along these axes, in pixels or, if only relative errors are known, in arbitrary units."""
 SOURCE: Final = 12
 """Row of the detection in the caller's arrays."""
 OFFSET_U: Final = 13
 OFFSET_V: Final = 14
-"""Position relative to the centre of the camera, pixels."""
+"""Position relative to the centre of the camera along the same axes, pixels."""
 COLUMNS: Final = 15
 
 NOWHERE: Final = 1e-9
@@ -61,7 +61,10 @@ FAINTEST: Final = 99.0
 
 
 class Raw(NamedTuple):
-    """Input from the caller: camera (`starid.camera.Camera.params`), positions, flux, errors (n, 2)."""
+    """Input from the caller: camera (`starid.camera.Camera.params`), positions, flux, errors.
+
+    The errors (n, 3) are standard deviations along two perpendicular axes, and the angle from column to first axis.
+    """
 
     params: Array
     xy: Array
@@ -119,6 +122,17 @@ def fill_direction(params: Array, scale: float, column: float, row: float, table
 
 
 @inner
+def _to_error_axes(angle: float, first: int, second: int, count: int, table: Table, n: int) -> None:
+    """Rotate `count` pairs of columns of a row from the image's axes to those of the error."""
+    if angle == 0.0:
+        return
+    c, s = math.cos(angle), math.sin(angle)
+    for k in range(count):
+        u, v = table[n, first + k], table[n, second + k]
+        table[n, first + k], table[n, second + k] = c * u + s * v, c * v - s * u
+
+
+@inner
 def observe(raw: Raw) -> Table:
     """Sort detections by decreasing flux, compute directions, drop those outside the image circle."""
     order = by_decreasing_flux(raw.flux)
@@ -131,6 +145,8 @@ def observe(raw: Raw) -> Table:
         table[n, MAGNITUDE] = -2.5 * math.log10(flux[row]) if flux[row] > 0.0 else FAINTEST
         table[n, SIGMA_U], table[n, SIGMA_V] = sigmas[row, 0], sigmas[row, 1]
         table[n, OFFSET_U], table[n, OFFSET_V] = xy[row, 0] - params[CX], xy[row, 1] - params[CY]
+        _to_error_axes(sigmas[row, 2], U_X, V_X, 3, table, n)
+        _to_error_axes(sigmas[row, 2], OFFSET_U, OFFSET_V, 1, table, n)
         table[n, SOURCE] = row
         n += 1
     return table[:n]
@@ -148,6 +164,8 @@ def observe_scaled(raw: Raw, observed: Table, scale: float, seen: Table) -> None
         row = int(np.int64(observed[i, SOURCE]))
         if not fill_direction(raw.params, scale, raw.xy[row, 0], raw.xy[row, 1], seen, i):
             seen[i, X], seen[i, Y], seen[i, Z] = 0.0, 0.0, NOWHERE
+            continue
+        _to_error_axes(raw.sigmas[row, 2], U_X, V_X, 3, seen, i)
 
 
 @inner

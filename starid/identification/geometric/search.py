@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices, Records
-from starid.camera.projection import HEIGHT, MODEL, WIDTH
+from starid.camera.projection import CX, CY, HEIGHT, MODEL, WIDTH
 from starid.identification.geometric.answer import (
     MIN_MATCHED,
     Answer,
@@ -25,8 +25,7 @@ from starid.identification.geometric.answer import (
 from starid.identification.geometric.lookup import find_triangles
 from starid.identification.geometric.observation import (
     MAGNITUDE,
-    OFFSET_U,
-    OFFSET_V,
+    SOURCE,
     Raw,
     Table,
     X,
@@ -218,7 +217,8 @@ def _detections_in_part(raw: Raw, observed: Table, part: int) -> Indices:
     members = np.empty(observed.shape[0], dtype=np.int64)
     count = 0
     for i in range(observed.shape[0]):
-        u, v = observed[i, OFFSET_U], observed[i, OFFSET_V]
+        row = int(np.int64(observed[i, SOURCE]))
+        u, v = raw.xy[row, 0] - raw.params[CX], raw.xy[row, 1] - raw.params[CY]
         if part == PARTS - 1:
             inside = abs(u) < half_width and abs(v) < half_height
         else:

@@ -245,7 +245,8 @@ class ClassicIdentifier(VerifiedIdentifier):
         return GuideStars(np.ascontiguousarray(stars.vectors), stars.v.copy(), row)
 
     def _identify(self, measured: CheckedDetections) -> Solution:
-        observed = self._observed(measured.xy, measured.flux, measured.given_sigmas)
+        sigmas = measured.sigmas[:, :2] if measured.sigmas_known else None
+        observed = self._observed(measured.xy, measured.flux, sigmas)
         if len(observed.row) < self.min_stars:
             return Solution.invalid(Reason.TOO_FEW_STARS)
         proposed = self._match(observed)

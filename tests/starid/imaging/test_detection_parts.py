@@ -9,6 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
+from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
 from scipy.special import erf
 from scipy.stats import norm
 
@@ -34,7 +36,7 @@ from starid.imaging.normal_table import normal
 from starid.imaging.spot_shape import trail_length
 from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
-from starid.imaging.trail_flow import fit_flow, lengths_and_mismatches, trail_at
+from starid.imaging.trail_flow import fit_flow, lengths_and_mismatches, trail_at, trail_shifts
 
 RNG_SEED = 12
 
@@ -252,6 +254,45 @@ def test_few_trails_give_a_simple_flow(count: int) -> None:
     found = np.zeros(5)
     fit_flow(places, flow_trails(truth, places, 0.02), found)
     assert min(np.abs(found - truth).max(), np.abs(found + truth).max()) < 0.2
+
+
+@pytest.mark.parametrize("length", [0.3, 2.0, 8.0, 22.0])
+def test_a_straight_trail_fitted_to_a_curved_one_is_shifted_as_stated(length: float) -> None:
+    """The fit is by least squares on the light of a star whose path is the solution of the flow's differential equation."""
+    size, sigma = 937, 0.85
+    flow = length * np.array([0.7, -0.3, 0.6, 0.15, -0.1])
+
+    def rate(_: float, p: np.ndarray) -> np.ndarray:
+        return np.array(trail_at(flow, *p, size, size))
+
+    start = np.array([750.3, 610.6])
+    times = 0.5 * np.polynomial.legendre.leggauss(81)[0]
+    weights = 0.5 * np.polynomial.legendre.leggauss(81)[1]
+    path = np.concatenate([
+        solve_ivp(rate, (0.0, side), start, t_eval=np.sort(t)[:: int(np.sign(side))], rtol=1e-11, atol=1e-9).y.T
+        for side, t in ((-0.5, times[:40]), (0.5, times[40:]))
+    ])  # fmt: skip
+    order = np.concatenate([times[:40][::-1], times[40:]])
+    weights = weights[np.argsort(times)][np.searchsorted(np.sort(times), order)]
+    x, y = np.meshgrid(np.arange(-30, 31) / 1.5, np.arange(-30, 31) / 1.5)
+    x, y = x + start[0], y + start[1]
+
+    def light(points: np.ndarray) -> np.ndarray:
+        each = np.exp(
+            -0.5 * ((x[..., None] - points[:, 0]) ** 2 + (y[..., None] - points[:, 1]) ** 2) / sigma**2
+        )
+        return each @ weights
+
+    seen = light(path)
+    straight = np.array(trail_at(flow, *start, size, size))
+
+    def misfit(p: np.ndarray) -> np.ndarray:
+        return (p[2] * light(p[:2] + order[:, None] * straight) - seen).ravel()
+
+    fitted = least_squares(misfit, np.array([*start, 1.0]), xtol=1e-14, ftol=1e-14, gtol=1e-14).x[:2]
+    stated, trails = trail_shifts(flow, start[None], (size, size), sigma, float(np.hypot(*straight)))
+    assert trails[0] == pytest.approx(straight)
+    assert stated[0] == pytest.approx(fitted - start, abs=0.05 * np.hypot(*(fitted - start)) + 1e-6)
 
 
 def test_a_turning_pinhole_camera_makes_such_a_flow() -> None:

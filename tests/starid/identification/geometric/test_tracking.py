@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 
 from starid.attitude import Attitude, propagate, random_attitude
 from starid.camera import DEFAULT_CAMERA
@@ -177,6 +178,37 @@ def test_missing_stars_need_a_valid_solution_and_a_radius() -> None:
         missing_stars(Solution.invalid(Reason.NO_MATCH), DEFAULT_CAMERA, stars, xy)
     with pytest.raises(StaridError, match="radius_px"):
         missing_stars(identifier().identify(xy, flux), DEFAULT_CAMERA, stars, xy, radius_px=0.0)
+
+
+def test_the_attitude_weights_errors_along_and_across_a_trail_by_their_covariance() -> None:
+    """Compared with weighted least squares by `scipy.optimize`."""
+    xy, flux, _ = sky(AT, limit=4.5)
+    rng = np.random.default_rng(12)
+    angle, count = rng.uniform(0.0, math.pi, len(xy)), len(xy)
+    axes = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=1).reshape(-1, 2, 2)
+    sigma = np.column_stack([rng.uniform(0.5, 1.0, count), rng.uniform(0.02, 0.1, count)])
+    measured = xy + np.einsum("nij,ni->nj", axes, sigma * rng.standard_normal((count, 2)))
+    covariance = np.einsum("nij,ni,nik->njk", axes, sigma**2, axes)
+    solution = identifier().track(measured, flux, AT, covariance)
+    used, stars = solution.detection_index, identifier().stars
+    icrs = stars.vectors[stars.index_of(solution.hip)]
+
+    def residuals(turn: np.ndarray) -> np.ndarray:
+        off = measured[used] - DEFAULT_CAMERA.project(AT.rotated(turn).to_sensor(icrs))[0]
+        return (np.einsum("nij,nj->ni", axes[used], off) / sigma[used]).ravel()
+
+    best = least_squares(residuals, np.zeros(3), x_scale=1e-6, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert len(used) > 0.9 * count
+    assert solution.attitude.error_to(AT.rotated(best.x)).total_arcsec < 0.05
+    given = Identifier.verify(identifier(), measured, flux, AT, covariance, window_px=12.0)
+    assert given.quaternion_xyzw == pytest.approx(solution.quaternion_xyzw, abs=1e-12)
+
+
+def test_a_covariance_that_is_not_positive_is_named() -> None:
+    xy, flux, _ = sky(AT)
+    errors = np.tile([[1.0, 2.0], [2.0, 1.0]], (len(xy), 1, 1))
+    with pytest.raises(StaridError, match="finite and positive"):
+        identifier().track(xy, flux, AT, errors)
 
 
 FEW = 300

@@ -1,0 +1,54 @@
+"""The uncertainty that the device states is that of its attitudes, at rest and at its largest rate.
+
+The squared error in units of the stated variance is χ²-distributed, so the mean of n such squares with k degrees of freedom is 1
+with a standard deviation of √(2/(kn)).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from starhil.emulator.benchmarks.ecss_campaign import Condition, EcssDevice, EcssPlan
+from starhil.emulator.sensor.pipeline.messages import FrameResult
+from starid.attitude import ARCSEC_PER_RAD, Attitude
+
+SIGMAS = 4.0
+"""Tolerance in standard deviations of the mean."""
+
+
+def errors_over_stated(profile: str, rate_deg_s: float, frames: int, *overrides: str) -> np.ndarray:
+    """Errors about x, y and z over the stated uncertainty across and about the boresight, (n, 3)."""
+    device = EcssDevice(EcssPlan(profile, overrides, seed=3))
+    condition = Condition("stated", "rate", rate_deg_s, frames)
+    rows = []
+    for number in range(frames):
+        shot, result = device.solve(condition, number)
+        assert isinstance(result, FrameResult)
+        if result.valid:
+            error = Attitude(np.array(result.quaternion_xyzw)).error_to(shot.attitude).rotation_vector_rad
+            stated = np.array(
+                [result.sigma_cross_arcsec, result.sigma_cross_arcsec, result.sigma_roll_arcsec]
+            )
+            rows.append(error * ARCSEC_PER_RAD / stated)
+    assert len(rows) > 0.98 * frames
+    return np.array(rows)
+
+
+def test_an_error_of_the_calibration_is_not_taken_for_noise_about_the_boresight() -> None:
+    about = errors_over_stated("cubestar", 0.0, 300)[:, 2]
+    assert np.mean(about**2) == pytest.approx(1.0, abs=SIGMAS * math.sqrt(2.0 / len(about)))
+    for limit, share in ((1.0, 0.683), (2.0, 0.954), (3.0, 0.9973)):
+        sampling = math.sqrt(share * (1.0 - share) / len(about))
+        assert np.mean(np.abs(about) < limit) == pytest.approx(share, abs=SIGMAS * sampling)
+
+
+@pytest.mark.parametrize(("rate_deg_s", "exposure_ms"), [(2.0, 200), (5.0, 100), (5.0, 200)])
+def test_trails_do_not_make_the_stated_uncertainty_too_small(rate_deg_s: float, exposure_ms: int) -> None:
+    over = errors_over_stated("ideal", rate_deg_s, 200, f"parameters.exposure={exposure_ms}")
+    assert np.mean(over**2) == pytest.approx(1.0, abs=SIGMAS * math.sqrt(2.0 / over.size))
+    for limit, share in ((1.0, 0.683), (2.0, 0.954), (3.0, 0.9973)):
+        sampling = math.sqrt(share * (1.0 - share) / over.size)
+        assert np.mean(np.abs(over) < limit) > share - SIGMAS * sampling
