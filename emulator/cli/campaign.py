@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
-from starhil.emulator.cli.options import Jobs, Seed, Settings, names_of
+from starhil.emulator.cli.options import Jobs, OrbitChoice, Seed, Settings, names_of, with_orbit
 from starid.cli.options import AsJson
 from starid.cli.output import Column, print_table
 
@@ -59,6 +59,7 @@ class EcssOptions:
     profile: Annotated[
         str, typer.Option(help="Device profile: a name or a TOML file.", autocompletion=names_of("profile"))
     ] = "cubestar"
+    orbit: OrbitChoice = None
     setting: Settings = None
     confidence: Annotated[float, typer.Option(help="Confidence level of the errors, 0.5 to below 1.")] = 0.997
     rest_frames: Annotated[int, typer.Option(min=10, help="Images at random attitudes, at rest.")] = 2000
@@ -117,7 +118,7 @@ def campaigns(
         import_module("matplotlib")
     plan = EcssPlan(
         images.profile,
-        tuple(images.setting or ()),
+        tuple(with_orbit(images.setting, images.orbit)),
         images.seed,
         fields=images.fields,
         rest_frames=images.rest_frames,
@@ -231,6 +232,7 @@ def algorithms(
     profile: Annotated[
         str, typer.Option(help="Device profile: a name or a TOML file.", autocompletion=names_of("profile"))
     ] = "cubestar",
+    orbit: OrbitChoice = None,
     setting: Settings = None,
     frames: Annotated[int, typer.Option(min=1, help="Number of images in each condition.")] = 200,
     seed: Seed = 1,
@@ -247,7 +249,7 @@ def algorithms(
     """
     from starhil.emulator.benchmarks.algorithms import SCENES, AlgorithmPlan, run_algorithms
 
-    plan = AlgorithmPlan(profile, frames, seed, tuple(setting or ()))
+    plan = AlgorithmPlan(profile, frames, seed, tuple(with_orbit(setting, orbit)))
     scenes = SCENES[:1] if lost_only else SCENES
     rows = list(_with_progress(run_algorithms(plan, scenes), 3 * len(scenes)))
     if as_json:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
-from starhil.emulator.cli.options import BenchOptions, Settings, checked_dialect
+from starhil.emulator.cli.options import BenchOptions, OrbitChoice, Settings, checked_dialect, with_orbit
 from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starid.cli.options import AsJson
 from starid.cli.output import output_help
@@ -38,6 +38,7 @@ class CaseOptions:
         typer.Option(min=1, max=127, help="Also test the CANopen node with this ID on the CAN channel."),
     ] = None
     eds: Annotated[Path | None, typer.Option(help="EDS file of the CANopen node; default: starhil's.")] = None
+    orbit: OrbitChoice = None
     settings: Settings = None
     truth: Annotated[
         str | None,
@@ -79,8 +80,10 @@ class CaseOptions:
         serial, can, canopen = bench.serial, bench.can, self.canopen
         if (bench.start or list_only) and serial is None and can is None:
             serial, can, canopen = links_of(load_unit(bench.unit or DEFAULT_UNIT), canopen)
-        if self.settings and not bench.start:
-            raise BenchError("--set needs --start: it overrides a key of the emulator's profile")
+        settings = with_orbit(self.settings, self.orbit)
+        if settings and not bench.start:
+            option = "--set" if self.orbit is None else "--orbit"
+            raise BenchError(f"{option} needs --start: it overrides a key of the emulator's profile")
         if self.truth is not None and bench.start:
             raise BenchError("--truth is for a unit that runs already; with --start the truth is known")
         if canopen is not None and can is None:
@@ -95,7 +98,7 @@ class CaseOptions:
             eds=self.eds,
             start=bench.start,
             profile=bench.profile,
-            settings=tuple(self.settings or ()),
+            settings=tuple(settings),
             truth=self.truth,
             dialect=checked_dialect(bench.dialect),
             baud=self.baud,

@@ -58,6 +58,15 @@ Settings: TypeAlias = Annotated[
     list[str] | None,
     typer.Option("--set", help="Override a key of the profile: section.key=value. Repeatable."),
 ]
+OrbitChoice: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--orbit",
+        help="Orbit with date, Sun, Moon, Earth, aberration, radiation and temperature: leo, or a TOML file with sections of a profile.",
+        show_default="the profile's; most have none",
+        autocompletion=names_of("orbit"),
+    ),
+]
 SerialDialect: TypeAlias = Annotated[
     str | None,
     typer.Option("--dialect", help="Format of serial replies, if the unit has several: a, b (default) or c."),
@@ -73,6 +82,12 @@ UnitChoice: TypeAlias = Annotated[
 ]
 Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
 Jobs: TypeAlias = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.")]
+
+
+def with_orbit(settings: list[str] | None, orbit: str | None) -> list[str]:
+    """Return the settings of a profile with those of `--orbit`."""
+    return [*([] if orbit is None else [f"orbit={orbit}"]), *(settings or ())]
+
 
 DIALECTS = ("a", "b", "c")
 

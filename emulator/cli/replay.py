@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import Settings, names_of
+from starhil.emulator.cli.options import OrbitChoice, Settings, names_of, with_orbit
 from starid.cli.options import AsJson
 
 
@@ -23,6 +23,7 @@ def command(
             autocompletion=names_of("profile"),
         ),
     ] = None,
+    orbit: OrbitChoice = None,
     overrides: Settings = None,
     as_json: AsJson = False,
 ) -> int:
@@ -38,9 +39,10 @@ def command(
     from starhil.emulator.links.table import LINKS
     from starhil.emulator.profile import load_profile
 
-    if overrides and profile is None:
-        raise EmulatorError("--set: changes the profile given by --profile; give both")
-    changed = None if profile is None else load_profile(profile, overrides or ())
+    settings = with_orbit(overrides, orbit)
+    if settings and profile is None:
+        raise EmulatorError("--set and --orbit: change the profile given by --profile; give both")
+    changed = None if profile is None else load_profile(profile, settings)
     report = asyncio.run(replay(folder, changed))
     if as_json:
         print(json.dumps(dataclasses.asdict(report)))

@@ -15,12 +15,14 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import (
+    OrbitChoice,
     ProfileArgument,
     Settings,
     UnitChoice,
     checked_dialect,
     list_option,
     names_of,
+    with_orbit,
 )
 from starhil.emulator.cli.output import report_slow_start
 from starhil.emulator.console.recorders import RECORDERS
@@ -116,6 +118,7 @@ class DeviceOptions:
         Key("links.serial.symlink", _symlink),
         typer.Option(help="Symbolic link to the pty; removed at the end."),
     ] = None
+    orbit: OrbitChoice = None
     settings: Settings = None
 
     def profile(self, name: str, number: int) -> Profile:
@@ -128,7 +131,7 @@ class DeviceOptions:
             for key in get_args(hint)
             if isinstance(key, Key) and (value := getattr(self, option)) is not None
         ]
-        return load_profile(name, [*(self.settings or ()), *overrides])
+        return load_profile(name, [*with_orbit(self.settings, self.orbit), *overrides])
 
 
 @dataclass(frozen=True)

@@ -198,6 +198,8 @@ OF_ATTITUDES: Final = {
 def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> Profile:
     """Read a profile and the profiles it extends, and apply `section.key=value` overrides.
 
+    `orbit=NAME` comes first: it merges a bundled orbit, or a TOML file, with all that belongs to it (`configs/orbits`).
+
     Raises EmulatorError: each problem names file or option, key and remedy.
     """
     path = find_toml("profile", name_or_path)
@@ -209,7 +211,13 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
         values = merge(values, table)
     if any(override.startswith("camera.") for override in overrides):
         _drop_parameters_of_camera(values)
-    layers += [_apply_override(values, override) for override in overrides]
+    presets = [override for override in overrides if override.partition("=")[0].strip() == "orbit"]
+    for preset in presets:
+        name = preset.partition("=")[2].strip().strip("\"'")
+        table = read_toml(find_toml("orbit", name), "orbit")
+        values = merge({key: value for key, value in values.items() if key != "orbit"}, table)
+        layers.append((f"orbit {name}", table))
+    layers += [_apply_override(values, override) for override in overrides if override not in presets]
     found: list[tuple[Sequence[object], str]] = []
     profile = None
     try:

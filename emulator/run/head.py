@@ -203,7 +203,8 @@ class Head:
             raise error
         await awake
         unit = quote(self.profile.unit_source, safe="/:.~")  # a field has no blanks
-        return {**self.ready_fields, "unit": unit, "seed": str(self.profile.run.seed)}
+        orbit = "none" if self.profile.orbit is None else self.profile.orbit.kind
+        return {**self.ready_fields, "unit": unit, "seed": str(self.profile.run.seed), "orbit": orbit}
 
     async def close(self) -> None:
         """Close everything, even if closing one of them fails, which is logged."""

@@ -7,7 +7,7 @@ from typing import Final, Literal, TypeAlias
 
 from starhil.protocol.errors import IcdError, did_you_mean
 
-Kind: TypeAlias = Literal["profile", "scenario", "session", "unit"]
+Kind: TypeAlias = Literal["orbit", "profile", "scenario", "session", "unit"]
 
 CONFIGS: Final = Path(__file__).resolve().parents[2] / "configs"
 """Folder `configs` of the installation or checkout."""

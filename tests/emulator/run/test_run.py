@@ -52,6 +52,7 @@ def test_the_ready_line_names_links_seed_and_clock(run):
         assert words["dialect"] == "b"
         assert words["unit"] == "cubestar"
         assert words["seed"] == "1"
+        assert words["orbit"] == "none"
         assert words["clock"] == "stepped"
         assert words["control"].startswith("unix:/")
 
