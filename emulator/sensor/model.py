@@ -32,7 +32,7 @@ def _limited(default: float, low: float, high: float, unit: str) -> Any:
 
 @dataclass(frozen=True)
 class SensorModel:
-    """Optics and detector of a star sensor; the defaults match the CubeStar class.
+    """Optics and detector of a star sensor; the defaults have the field and the pixels of CubeStar, and a far larger lens.
 
     A 12 mm f/1.2 lens of 14.6 mm focal length images 42° onto 937 pixels of 12 µm. A star of V = 0 and solar
     colour yields 4.6e10 photons/s/m² between 400 and 900 nm: 3.63e-11 W/m²/nm at 550 nm are 1.0e8
