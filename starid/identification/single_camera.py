@@ -84,12 +84,18 @@ def checked_detections(
 
 
 def _principal_axes(covariance: Array) -> Array:
-    """Return errors (n, 3), as in `CheckedDetections`, of covariances (n, 2, 2); NaN if one is not positive definite."""
+    """Return errors (n, 3), as in `CheckedDetections`, of covariances (n, 2, 2); NaN if one is not positive definite.
+
+    With square roots and divisions alone, so they are equal on every processor.
+    """
     xx, yy, xy = covariance[:, 0, 0], covariance[:, 1, 1], 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
-    middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    middle, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    length = np.sqrt(half * half + xy * xy)
+    sense = np.where(half >= 0.0, 1.0, -1.0)
     with np.errstate(invalid="ignore"):
-        sigmas = np.sqrt(np.column_stack([middle + half, middle - half]))
-    return np.column_stack([sigmas, 0.5 * np.arctan2(2.0 * xy, xx - yy)])
+        first, second = np.sqrt(middle + sense * length), np.sqrt(middle - sense * length)
+        slope = np.where(length > 0.0, sense * xy / (length + np.abs(half)), 0.0)
+    return np.column_stack([first, second, slope])
 
 
 class CheckedDetections(NamedTuple):
@@ -102,8 +108,8 @@ class CheckedDetections(NamedTuple):
     flux : ndarray (n,)
         Flux in any linear unit.
     sigmas : ndarray (n, 3)
-        One-sigma errors of the positions along two perpendicular axes, pixels, and the angle from +x to the first axis,
-        radians; ones along x and y if none were given.
+        One-sigma errors of the positions along two perpendicular axes, pixels, and the slope dy/dx of the first; ones along
+        x and y if none were given.
     sigmas_known : bool
         Whether errors were given.
     observer_velocity : array (3,), optional
@@ -121,14 +127,12 @@ class CheckedDetections(NamedTuple):
         """The errors as given to an identifier, (n, 2) or (n, 2, 2); None if none were given."""
         if not self.sigmas_known:
             return None
-        first, second, angle = self.sigmas.T
-        if not angle.any():
+        slope = self.sigmas[:, 2]
+        if not slope.any():
             return np.ascontiguousarray(self.sigmas[:, :2])
-        axes = np.stack([np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)], axis=1).reshape(
-            -1, 2, 2
-        )
-        variances = np.column_stack([first, second])[:, :, None] ** 2
-        return np.asarray(axes.transpose(0, 2, 1) @ (variances * axes))
+        first, second = self.sigmas[:, :2].T ** 2 / (1.0 + slope * slope)
+        xx, yy, xy = first + second * slope**2, first * slope**2 + second, (first - second) * slope
+        return np.asarray(np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2))
 
     @classmethod
     def of(

@@ -63,7 +63,7 @@ FAINTEST: Final = 99.0
 class Raw(NamedTuple):
     """Input from the caller: camera (`starid.camera.Camera.params`), positions, flux, errors.
 
-    The errors (n, 3) are standard deviations along two perpendicular axes, and the angle from column to first axis.
+    The errors (n, 3) are standard deviations along two perpendicular axes, and the slope of the first, rows over columns.
     """
 
     params: Array
@@ -122,11 +122,12 @@ def fill_direction(params: Array, scale: float, column: float, row: float, table
 
 
 @inner
-def _to_error_axes(angle: float, first: int, second: int, count: int, table: Table, n: int) -> None:
-    """Rotate `count` pairs of columns of a row from the image's axes to those of the error."""
-    if angle == 0.0:
+def _to_error_axes(slope: float, first: int, second: int, count: int, table: Table, n: int) -> None:
+    """Turn `count` pairs of columns of a row from the image's axes to those of the error."""
+    if slope == 0.0:
         return
-    c, s = math.cos(angle), math.sin(angle)
+    c = 1.0 / math.sqrt(1.0 + slope * slope)
+    s = slope * c
     for k in range(count):
         u, v = table[n, first + k], table[n, second + k]
         table[n, first + k], table[n, second + k] = c * u + s * v, c * v - s * u
