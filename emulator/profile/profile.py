@@ -24,6 +24,7 @@ from starhil.emulator.profile.sections import (
     CalibrationConfig,
     CameraConfig,
     CatalogConfig,
+    ClockConfig,
     DeviceConfig,
     ImagesConfig,
     LinksConfig,
@@ -88,6 +89,8 @@ class Profile(Strict):
     """Identification and boot."""
     timing: TimingConfig = TimingConfig()
     """Modelled processing times."""
+    clock: ClockConfig = ClockConfig()
+    """Errors of the clock and of the latency."""
     power: PowerConfig = PowerConfig()
     """Currents by phase."""
     thermal: ThermalConfig = ThermalConfig()
@@ -184,7 +187,7 @@ _LONGEST_SHOWN: Final = 200
 
 _A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
 OF_FAULTS: Final = dict.fromkeys(
-    ("fault", "faults", "optical", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
+    ("fault", "faults", "optical", "telemetry", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
      "delay_s", "split", "gap_s"),
     _A_FAULT,
 )  # fmt: skip

@@ -96,7 +96,7 @@ class Head:
                 wiring.background(background),
             )
             self.requests = Requests(self.device)
-            self.faults = Faults(self.device, self.links)
+            self.faults = Faults(self.requests, self.links)
             self.device.signals.frame_published.connect(_log_frame)
             self.device.power_on()
         except EmulatorError:

@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import Field, RootModel, field_serializer, model_validator
 
+from starhil.emulator.device.cycle import Phase
 from starhil.emulator.links.table import LINKS, LinkName
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.simulation.config_model import Strict
@@ -117,6 +118,13 @@ class ClearedFaults(TimedEntry):
     do: Literal["clear_faults"] = "clear_faults"
 
 
+class AwaitedPhase(TimedEntry):
+    """A wait for a phase of the next exposure, which is an event of the device."""
+
+    do: Literal["wait"] = "wait"
+    phase: Phase
+
+
 class End(TimedEntry):
     """The end of the run."""
 
@@ -133,6 +141,7 @@ Entry: TypeAlias = (
     | NewTruth
     | NewFaults
     | ClearedFaults
+    | AwaitedPhase
     | End
 )
 
