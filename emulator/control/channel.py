@@ -308,6 +308,8 @@ class ControlServer:
     async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
         wanted = await _parse(FaultRequest, request)
         head.faults.check(wanted)
+        if wanted.optical is not None:
+            await head.prepare_sky(wanted.optical)
         self._run.wiring.enter(NewFaults, request=wanted)
         head.faults.inject(wanted)
         return {"faults": head.faults.describe()}
@@ -321,7 +323,10 @@ class ControlServer:
         if self._run.wiring.records:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         name, start_s = str(request.get("name", "")), self._run.clock.now_ns() / NANOSECONDS
-        events = await asyncio.to_thread(lambda: load_scenario(name).prepare(head, self._run.truth, start_s))
+        scenario = await asyncio.to_thread(load_scenario, name)
+        events = await asyncio.to_thread(scenario.prepare, head, self._run.truth, start_s)
+        for sky in scenario.skies:
+            await head.prepare_sky(sky)
         head.device.scheduler.add(events)
         return {"events": len(events)}
 

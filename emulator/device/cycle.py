@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, Literal, TypeAlias, TypeVar
+from typing import Any, Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -43,6 +43,7 @@ from starhil.emulator.simulation.clock import DeviceTime
 from starhil.emulator.simulation.scheduler import Action, Event, Scheduler
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.icd.conventions import NANOSECONDS
+from starhil.protocol.icd.values import Value
 from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.identification.attitude_history import AttitudeHistory
@@ -269,6 +270,28 @@ class FrameCycle:
     def index_request(self) -> IndexRequest:
         """Return the request for the star index of the current parameters."""
         return IndexRequest(SolverSettings.of(self._parameters), self.upsets)
+
+    def rehearsals(self, constants: Mapping[str, Value], skies: Sequence[Mapping[str, Any]]) -> IndexRequest:
+        """Return the request to prepare frames with the present parameters, and with each of these optical faults.
+
+        `constants` are parameters that the device is going to take from the camera.
+        """
+        parameters, now_ns = {**self._parameters, **constants}, self._now_ns()
+        truth = self._surroundings.state(now_ns)
+        conditions = self._surroundings.conditions(truth)
+        settings = SolverSettings.of(parameters)
+        frame = FrameRequest(
+            index=0,
+            truth=truth,
+            exposure_s=float(parameters["exposure"]) / 1000.0,
+            gain=float(parameters["analog_gain"]),
+            settings=settings,
+            temperature_c=conditions.temperature_c,
+            particles_s=conditions.particles_s,
+            observer_velocity=self._assumed_velocity(now_ns),
+        )
+        frames = tuple(replace(frame, faults=dict(sky)) for sky in skies)
+        return IndexRequest(settings, self.upsets, frames)
 
     def single_frame(self, mid_ns: int) -> FrameRequest:
         """Return the request for an exposure that is not solved, with a given simulation time of mid-exposure."""

@@ -385,6 +385,18 @@ def rate_fields(icd: InterfaceDefinition) -> tuple[tuple[Field, int, float], ...
     )
 
 
+def constants_to_adopt(
+    parameters: Parameters, profile: Profile, constants: Mapping[str, Value]
+) -> dict[str, Value]:
+    """Return the camera constants that `adopt_camera` will make values of parameters."""
+    defaults = parameters.state.defaults
+    return {
+        name: value
+        for name, value in constants.items()
+        if name not in profile.parameters and parameters[name] == defaults[name]
+    }
+
+
 def adopt_camera(parameters: Parameters, profile: Profile, constants: Mapping[str, Value]) -> None:
     """Make camera constants the defaults, except those that the profile sets: a device may be miscalibrated on purpose."""
     parameters.adopt_defaults({k: v for k, v in constants.items() if k not in profile.parameters})
