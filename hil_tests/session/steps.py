@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Literal, Protocol, Self, TypeVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo, model_validator
 
@@ -26,7 +26,6 @@ from starhil.hil_tests.client.transactions import Ack, Reading
 from starhil.hil_tests.errors import BenchError, NackError
 from starhil.hil_tests.judge.links import BusName
 from starhil.hil_tests.rig.rig import Rig
-from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.expect import (
     AttitudeCheck,
     Conditions,
@@ -156,6 +155,13 @@ Link = Literal[BusName, "both"]
 # --- steps ---
 
 
+class TruthOverTime(Protocol):
+    """True attitudes over the time of the device."""
+
+    def at(self, time_s: float) -> Quaternion:
+        """Return the attitude at a Unix time of the device's clock."""
+
+
 @dataclass
 class SessionState:
     """What the steps of a session share."""
@@ -163,7 +169,7 @@ class SessionState:
     rig: Rig
     folder: Path
     """Gets CSV and image files."""
-    truth: Quaternion | TruthLogReader | None
+    truth: Quaternion | TruthOverTime | None
     captured: dict[str, Value] = field(default_factory=dict)
     """Value of each variable."""
     step_begin_s: float = 0.0
@@ -173,7 +179,7 @@ class SessionState:
         """Return the true attitude at the time of a reading."""
         if self.truth is None:
             raise BenchError("no truth to compare the attitude with")
-        if not isinstance(self.truth, TruthLogReader):
+        if isinstance(self.truth, Quaternion):
             return self.truth
         if "time_of_exposure" not in reading.values:
             raise BenchError(f"{reading.name} has no time; read precise_attitude")
@@ -209,6 +215,8 @@ class Step(Keys):
     needs_link: ClassVar[bool] = True
     needs_emulator: ClassVar[bool] = False
     """Whether the step is for an emulator that the bench has started."""
+    needs_control: ClassVar[bool] = False
+    """Whether the step is for an emulator whose control channel the bench has."""
 
     name: str = ""
     expect: dict[str, ReadConditions] = Field(default_factory=dict)
@@ -612,17 +620,17 @@ class Restart(Step):
 
 
 class Control(Step):
-    """Send a request on the control channel of the emulator that the session started."""
+    """Send a request on the control channel of the emulator."""
 
     default_name = "control channel: {self.action}"
     needs_link = False
-    needs_emulator = True
-    action: Literal["fault", "clear_faults", "set_truth", "scenario", "step"] = Field(alias="control")
+    needs_control = True
+    action: Literal["fault", "clear_faults", "set_truth", "scenario", "step", "wait"] = Field(alias="control")
     keys: Annotated[dict[str, Any], AfterValidator(_as_json)] = Field({}, alias="with")
 
     def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- no link
         """Send the request."""
-        return Attempt(detail=json.dumps(session.rig.control(self.action, self.keys)))
+        return Attempt(detail=in_words(session.rig.control(self.action, self.keys)))
 
 
 ACTIONS: Final[Mapping[str, type[Step]]] = {
@@ -639,6 +647,23 @@ ACTIONS: Final[Mapping[str, type[Step]]] = {
     "control": Control,
 }
 """Key of an action → its class."""
+
+
+def in_words(answer: Mapping[str, Any]) -> str:
+    """Return an answer of the control channel in one line, for people."""
+    return ", ".join(_shown(key, value) for key, value in answer.items())
+
+
+def _shown(key: str, value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"{key} {in_words(value) or 'none'}"
+    if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+        return "; ".join(_shown(key, item) for item in value)
+    if value is True:
+        return key
+    if isinstance(value, list):
+        return f"{key} {' '.join(map(show, value))}"
+    return f"{key} {show(value)}" if isinstance(value, int | float | str) else f"{key} none"
 
 
 def _in_csv(value: Value) -> Value:

@@ -140,7 +140,7 @@ def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
         (
             "[[step]]\nwait_s = 0\n[[step]]\ncontrol = 'clear_faults'\n",
             ["--serial", "/dev/no-such-port"],
-            "wrong.toml: step 2: control: only an emulator that the bench started",
+            "wrong.toml: step 2: control: only an emulator can do this: use --start, or --control",
         ),
         (
             "[[step]]\nrestart = 'kill'\n",
