@@ -38,7 +38,8 @@ def can_names(unit: Unit) -> dict[str, str]:
     possible with a last one that is not full); of telecommands `empty` (may be sent at any time), `short`, `longest`,
     `refused` and `eight` (with a value that must be refused, the second of 8 bytes); without a row `unknown`,
     `unknown_telemetry`. `single_size`, `single_data`: size and data, which for telemetry are any. `m0` to `m4`: segments of
-    a message that is answered by `refusal`, and `t0` to `t4` from another host. Each error has its code.
+    a message that is answered by `refusal`, and `t0` to `t4` from another host. Each error has its code; `host` and
+    `device` stay in braces until the probe replaces them.
     """
     telemetry = [row for row in unit.readable.values() if row.answers == ("reply",)]
     commands = [row for row in unit.telecommands.values() if row.answers == ("reply",)]
@@ -55,6 +56,7 @@ def can_names(unit: Unit) -> dict[str, str]:
         "eight": (row for row in commands if row.id in faulty and row.size == 8),
     }
     found = {name: f"{unit.code(name):02X}" for name in PUBLISHED}
+    found |= {name: f"{{{name}}}" for name in ("host", "device")}
     for name, choices in rows.items():
         for row in list(choices)[:1]:
             data = ".." * row.size if row.is_telemetry else faulty.get(row.id, b"").hex().upper()
@@ -74,11 +76,13 @@ def can_names(unit: Unit) -> dict[str, str]:
     if "unknown" in found:
         parts = _message(found["unknown"], bytes(range(30)))
         found |= {f"m{number}": part for number, part in enumerate(parts)}
-        found |= {f"t{number}": part.replace("HH", OTHER_HOST, 1) for number, part in enumerate(parts)}
+        found |= {f"t{number}": part.replace("{host}", OTHER_HOST) for number, part in enumerate(parts)}
         found |= {"m": " ".join(parts), "m_of_1750_bytes": " ".join(_message(found["unknown"], bytes(1750)))}
-        found["refusal"] = f"03{found['unknown']}DDHH#{found['invalid_id']}"
+        found["refusal"] = f"03{found['unknown']}{{device}}{{host}}#{found['invalid_id']}"
     answers = ((f"{row.id:02X}", row.size) for row in telemetry)
-    found["each_row"] = "; ".join(f"04{number}HHDD# > {_answer(number, size)}" for number, size in answers)
+    found["each_row"] = "; ".join(
+        f"04{number}{{host}}{{device}}# > {_answer(number, size)}" for number, size in answers
+    )
     return found
 
 
@@ -88,15 +92,15 @@ def _bad_data(row: Row) -> list[bytes]:
 
 def _message(number: str, data: bytes) -> list[str]:
     """Return the segments of a telecommand."""
-    return [f"07{number}HHDD#{part.hex().upper()}" for part in segments(data)]
+    return [f"07{number}{{host}}{{device}}#{part.hex().upper()}" for part in segments(data)]
 
 
 def _answer(number: str, size: int) -> str:
     """Return the pattern of telemetry, in one frame or in segments."""
     if size <= 8:
-        return f"05{number}DDHH#{'..' * size}"
+        return f"05{number}{{device}}{{host}}#{'..' * size}"
     parts = segments(bytes(size))
-    return " ".join(f"08{number}DDHH#{'..' * (len(part) - 1)}{part[-1]:02X}" for part in parts)
+    return " ".join(f"08{number}{{device}}{{host}}#{'..' * (len(part) - 1)}{part[-1]:02X}" for part in parts)
 
 
 def noise(probe: CanProbe) -> None:

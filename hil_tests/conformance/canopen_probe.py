@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from binascii import crc_hqx
 from collections.abc import Callable, Collection, Iterable
 from enum import IntEnum
@@ -10,6 +9,7 @@ from typing import Any, Final, TypeVar
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
+from starhil.hil_tests.client.raw_traffic import matches, pattern
 from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, Probe, check, check_equal
 from starhil.hil_tests.conformance.link_probe import checked_values
 from starhil.hil_tests.conformance.ports import CanFrame, Port
@@ -207,7 +207,10 @@ class CanopenProbe(Probe):
     ) -> None:
         """Send a frame; text is hexadecimal."""
         payload = bytes.fromhex(data) if isinstance(data, str) else data
-        frame = CanFrame(can_id, payload, extended=extended, remote=remote)
+        self.send_frame(CanFrame(can_id, payload, extended=extended, remote=remote))
+
+    def send_frame(self, frame: CanFrame) -> None:
+        """Send a frame as it is."""
         self.log.append(f"{self.now():.4f} -> {frame!s}")
         self.port.send(frame)
 
@@ -512,8 +515,7 @@ def check_abort(seen: bytes | None, *codes: int, multiplexer: str = "") -> None:
 
 def check_answer(seen: bytes | None, answer: str) -> None:
     """Fail unless an SDO answer has these bytes, of which `..` is any one, and a final `*` any others."""
-    pattern = re.escape(answer.replace(" ", "")).replace(r"\.\.", "..").replace(r"\*", ".*")
-    if seen is None or re.fullmatch(pattern, seen.hex()) is None:
+    if seen is None or not matches(pattern(answer), seen.hex().upper()):
         raise CaseFailed(f"SDO answer {answer}", _seen(seen))
 
 

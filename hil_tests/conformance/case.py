@@ -52,6 +52,10 @@ class Probe(ABC):
     def sleep(self, seconds: float) -> None:
         """Wait."""
 
+    @abstractmethod
+    def drain(self) -> None:
+        """Discard everything received."""
+
     # --- rows ---
 
     @abstractmethod

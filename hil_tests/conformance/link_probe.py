@@ -142,9 +142,14 @@ class LinkProbe(Probe):
     def post_request(self, request: Request, *, answered: bool = True) -> None:
         """Send a request without waiting; `answered` unless no answer is expected."""
 
+    @property
+    def addresses(self) -> Mapping[str, str]:
+        """Names in braces for the addresses on the link, which a case written as text has in its traffic."""
+        return {}
+
     @abstractmethod
-    def exchange(self, sent: str, answers: Sequence[str]) -> None:
-        """Send raw traffic, and take the answers to it, which must be these; both in the format of `case_file`."""
+    def exchange(self, sent: Sequence[str], answers: Sequence[str]) -> None:
+        """Send raw traffic, and take the answers to it, which must be these; both in the format of `dialogue`."""
 
     @abstractmethod
     def _answer_within(self, seconds: float) -> Answer | None:

@@ -129,12 +129,12 @@ class SerialProbe(LinkProbe):
         """Return whether a refusal differs from the data, which in dialects a and b may be one byte as well."""
         return self.dialect not in ("a", "b") or row.size != 1
 
-    def exchange(self, sent: str, answers: Sequence[str]) -> None:
+    def exchange(self, sent: Sequence[str], answers: Sequence[str]) -> None:
         """Send bytes, and take the telemetry or the refusal of each row."""
         requests = [self.unit.request(int(answer.partition("!")[0])) for answer in answers]
         for request in requests:
             self.line.expect(request)
-        self.send(bytes.fromhex(sent))
+        self.send(bytes.fromhex("".join(sent)))
         for request, answer in zip(requests, answers, strict=True):
             row, error = self.unit.row(request), answer.partition("!")[2]
             if error or row is None:
