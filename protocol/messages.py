@@ -102,7 +102,7 @@ class Request:
     data: bytes = b""
     source: int = 0
     """Address of the sender; 0 on a serial line whose messages carry none."""
-    klass: str = ""
+    message_class: str = ""
     """Class of the row, if the unit has classes."""
     sequence: int = 0
     """Sequence number in the header, if any; the reply repeats it."""
@@ -132,7 +132,7 @@ class Reply:
     """Address of the receiver (set on the device side); 0 on a serial line whose messages carry none."""
     source: int = 0
     """Address of the sender (set on the OBC side); 0 on a serial line whose messages carry none."""
-    klass: str = ""
+    message_class: str = ""
     """Class of the row, if the unit has classes."""
     sequence: int = 0
     flags: int = 0
@@ -151,7 +151,7 @@ class Reply:
             request.id,
             request.data,
             destination=request.source,
-            klass=request.klass,
+            message_class=request.message_class,
             sequence=request.sequence,
             flags=request.flags,
         )

@@ -38,9 +38,9 @@ class Requests:
             row.name: TelecommandBinding(row, icd) for row in icd.telecommands.values()
         }
         self._telemetry_rows = {
-            (row.klass, row.id): row for row in icd.telemetry.values() if not row.only_sent
+            (row.message_class, row.id): row for row in icd.telemetry.values() if not row.only_sent
         }
-        self._telecommand_rows = {(row.klass, row.id): row for row in icd.telecommands.values()}
+        self._telecommand_rows = {(row.message_class, row.id): row for row in icd.telecommands.values()}
         serial = icd.link.serial
         self._stamped = serial is not None and any(
             item.role in ("ticks", "time") for item in serial.reply_header
@@ -57,12 +57,12 @@ class Requests:
         if device.unresponsive:
             return []
         if request.kind is RequestKind.TELEMETRY:
-            row = self._telemetry_rows.get((request.klass, request.id))
+            row = self._telemetry_rows.get((request.message_class, request.id))
             if not console:
                 device.counters = device.counters.with_telemetry()
             shot = device.snapshot()
             return self._replies(request, row, self._answer_telemetry(request, row, shot), shot)
-        row = self._telecommand_rows.get((request.klass, request.id))
+        row = self._telecommand_rows.get((request.message_class, request.id))
         device.counters = device.counters.with_telecommand()
         outcome = self._execute(request, row)
         if isinstance(outcome, PendingAnswer):
@@ -111,7 +111,11 @@ class Requests:
             elif reply.kind is not ReplyKind.NACK:
                 other = self.device.icd.telemetry[answer.partition(":")[2]]
                 as_request = replace(
-                    request, kind=RequestKind.TELEMETRY, id=other.id, klass=other.klass, data=b""
+                    request,
+                    kind=RequestKind.TELEMETRY,
+                    id=other.id,
+                    message_class=other.message_class,
+                    data=b"",
                 )
                 replies.append(self._answer_telemetry(as_request, other, shot))
         return [replace(item, final=item is replies[-1]) for item in replies]
@@ -156,7 +160,7 @@ class Requests:
             data,
             code,
             request.source,
-            klass=request.klass,
+            message_class=request.message_class,
             sequence=request.sequence,
             flags=request.flags,
         )
@@ -215,7 +219,9 @@ class Requests:
                 data = self.telemetry(row.name, shot)
             except Refused:  # the row cannot be read now, for example while an image is being opened
                 continue
-            reply = Reply(ReplyKind.UNSOLICITED, row.id, data, destination=host, klass=row.klass)
+            reply = Reply(
+                ReplyKind.UNSOLICITED, row.id, data, destination=host, message_class=row.message_class
+            )
             device.signals.unsolicited.emit(self._with_times(reply, shot))
             if row.action is not None:
                 shot = device.snapshot()  # after the action that follows the reading of the row

@@ -278,7 +278,7 @@ class AsyncObcClient:
             row is not None
             and reply.kind is ReplyKind.TELEMETRY
             and (row.unsolicited is not None or self.icd.selects_unsolicited)
-            and not self.link.marks_unsolicited(reply.klass)
+            and not self.link.marks_unsolicited(reply.message_class)
         ):
             self._on_unsolicited(reply)
         else:
@@ -286,9 +286,9 @@ class AsyncObcClient:
 
     def _answers(self, request: Request, reply: Reply) -> bool:
         """Return whether a reply answers a request; a telecommand may be answered with a telemetry row."""
-        if reply.id is None or (reply.id, reply.klass) == (request.id, request.klass):
+        if reply.id is None or (reply.id, reply.message_class) == (request.id, request.message_class):
             return reply.kind in _ANSWERS[request.kind]
-        row, answer = self.icd.row(request.id, request.klass), self._row_of(reply)
+        row, answer = self.icd.row(request.id, request.message_class), self._row_of(reply)
         return row is not None and answer is not None and f"row:{answer.name}" in row.answers
 
     def _on_unsolicited(self, reply: Reply) -> None:
@@ -303,7 +303,7 @@ class AsyncObcClient:
             queue.put_nowait(self._reading(reply, 0.0))
 
     def _row_of(self, reply: Reply) -> Row | None:
-        return None if reply.id is None else self.icd.row(reply.id, reply.klass)
+        return None if reply.id is None else self.icd.row(reply.id, reply.message_class)
 
     def _reading(self, reply: Reply, latency: float) -> Reading:
         row = self._row_of(reply)

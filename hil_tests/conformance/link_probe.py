@@ -100,7 +100,7 @@ def lively_row(unit: Unit, can_refuse: Callable[[str], bool]) -> Row:
     """Return the smallest row whose errors show: of several bytes, in a class that can be refused, read without effect."""
 
     def unsuitable(row: Row) -> tuple[bool, bool, bool, int]:
-        return row.action is not None, not can_refuse(row.klass), row.size < SHOWING, row.size
+        return row.action is not None, not can_refuse(row.message_class), row.size < SHOWING, row.size
 
     return min(unit.readable.values(), key=unsuitable)
 
@@ -201,7 +201,7 @@ class LinkProbe(Probe):
         """Return the answers of a row on this link."""
         return row.answers
 
-    def can_refuse(self, klass: str) -> bool:  # noqa: ARG002 -- for links on which it depends
+    def can_refuse(self, message_class: str) -> bool:  # noqa: ARG002 -- for links on which it depends
         """Return whether answers of a class can express a refusal."""
         return True
 
@@ -230,11 +230,11 @@ class LinkProbe(Probe):
         """Return the telemetry of the unit that can be read: by a request, or by waiting for it."""
         return (row for row in self.unit.telemetry.values() if not row.only_sent or row.is_streamed)
 
-    def post(self, row: Row | int, data: bytes = b"", klass: str = "") -> None:
+    def post(self, row: Row | int, data: bytes = b"", message_class: str = "") -> None:
         """Send a request for a row, or for an ID that need not belong to one, without waiting."""
-        self.post_request(self.unit.request(row, data, klass))
+        self.post_request(self.unit.request(row, data, message_class))
 
-    def ask(self, row: Row | int, data: bytes = b"", klass: str = "") -> Answer:
+    def ask(self, row: Row | int, data: bytes = b"", message_class: str = "") -> Answer:
         """Send a request and return the answer; of an answer in several parts, the last.
 
         Other rows that answer a request follow its reply, or stand for it.
@@ -245,13 +245,13 @@ class LinkProbe(Probe):
             others = [self.unit.telemetry[name] for name in named if name]
         if others and not self.names_rows:
             raise CaseSkipped(f"on this link an answer does not name its row, such as {others[0].name}")
-        self.post(row, data, klass)
+        self.post(row, data, message_class)
         answer = self.last_answer()
         if not isinstance(row, Row) or not others or answer.kind not in ("ack", "telemetry"):
             return answer
         if answer.row_id != row.id and "reply" not in self.answers(row):
             self._check_row(others.pop(0), answer)
-            answer = replace(answer, kind="ack", row_id=row.id, klass=row.klass)
+            answer = replace(answer, kind="ack", row_id=row.id, message_class=row.message_class)
         for other in others:
             self._check_row(other, self.next_answer())
         return answer
@@ -285,14 +285,19 @@ class LinkProbe(Probe):
         while self.now() < end:
             self._receive(end - self.now())
             for answer in self._unsolicited_answers():
-                if (answer.row_id, answer.klass) == (row.id, row.klass) and len(answer.data) == row.size:
+                if (answer.row_id, answer.message_class) == (row.id, row.message_class) and len(
+                    answer.data
+                ) == row.size:
                     return answer
         raise CaseFailed(f"{row.name} ({row.id}) of {row.size} bytes within {period_s:g} s", "nothing")
 
     def expect_telemetry(self, row: Row, timeout_s: float | None = None) -> Answer:
         """Take the next answer, which must be the telemetry of a row."""
         answer = self.next_answer(timeout_s)
-        named = answer.row_id is None or (answer.row_id, answer.klass) in ((row.id, row.klass), (row.id, ""))
+        named = answer.row_id is None or (answer.row_id, answer.message_class) in (
+            (row.id, row.message_class),
+            (row.id, ""),
+        )
         if answer.kind != "telemetry" or len(answer.data) != row.size or not named:
             raise CaseFailed(f"telemetry {row.name} ({row.id}) of {row.size} bytes", str(answer))
         return answer
@@ -320,21 +325,23 @@ class LinkProbe(Probe):
         accepted = answer.kind == "ack" and answer.row_id in (None, row.id)
         check(accepted, f"acknowledge of telecommand {row.name} ({row.id})", answer)
 
-    def expect_refusal(self, row: Row | int, data: bytes, error: str, klass: str = "") -> None:
+    def expect_refusal(self, row: Row | int, data: bytes, error: str, message_class: str = "") -> None:
         """Send a request that must be refused with a code.
 
         Where no answer can express the refusal it must not be answered, and a row that reports the last
         telecommand must report it.
         """
-        request = self.unit.request(row, data, klass)
+        request = self.unit.request(row, data, message_class)
         known = self.unit.row(request)
         what = f"{request} ({known.name})" if known is not None else str(request)
-        if not self.can_refuse(request.klass) or (known is not None and "reply" not in self.answers(known)):
+        if not self.can_refuse(request.message_class) or (
+            known is not None and "reply" not in self.answers(known)
+        ):
             self.post_request(request, answered=False)
             self.expect_silence(f"no answer can express the refusal of {what} on this link")
             self.check_reported(request.id, error)
             return
-        self.post(row, data, klass)
+        self.post(row, data, message_class)
         self.expect_nack(f"refusal of {what}", error)
 
     def expect_nack(self, what: str, error: str) -> None:

@@ -62,7 +62,7 @@ def row_cases(
     numbers: bool = True,
     marks: bytes = b"",
     highest_id: int = 255,
-    sizes: Callable[[str], range] = lambda _klass: ANY_SIZE,
+    sizes: Callable[[str], range] = lambda _message_class: ANY_SIZE,
 ) -> Iterator[Case[LinkProbe]]:
     """Yield the cases for the rows of a unit.
 
@@ -120,18 +120,22 @@ def _identifiers(unit: Unit, highest: int, sizes: Callable[[str], range]) -> Ite
     if not groups and unit.first_telemetry_id is not None:
         first = unit.first_telemetry_id
         groups = {"telemetry": ("", range(first, highest + 1)), "telecommands": ("", range(first))}
-    for name, (klass, numbers) in (groups or {"unknown": ("", range(highest + 1))}).items():
-        known = {row.id for row in unit.rows if not row.only_sent and (row.klass == klass or not klass)}
+    for name, (message_class, numbers) in (groups or {"unknown": ("", range(highest + 1))}).items():
+        known = {
+            row.id
+            for row in unit.rows
+            if not row.only_sent and (row.message_class == message_class or not message_class)
+        }
         unknown = [number for number in numbers if number not in known]
-        if klass:  # every class has all numbers: those beside its rows, and both ends
+        if message_class:  # every class has all numbers: those beside its rows, and both ends
             near = {row_id + step for row_id in known for step in (-1, 1)} | {0, highest}
             unknown = sorted(near & set(unknown))
 
-        def run(probe: LinkProbe, klass: str = klass, unknown: list[int] = unknown) -> None:
+        def run(probe: LinkProbe, message_class: str = message_class, unknown: list[int] = unknown) -> None:
             for row_id in unknown:
-                probe.expect_refusal(row_id, bytes(sizes(klass)[0]), INVALID_ID, klass)
+                probe.expect_refusal(row_id, bytes(sizes(message_class)[0]), INVALID_ID, message_class)
 
-        title = f"unknown {'IDs of class ' + klass if klass else 'IDs' if name == 'unknown' else name} are refused"
+        title = f"unknown {'IDs of class ' + message_class if message_class else 'IDs' if name == 'unknown' else name} are refused"
         yield case_in("identifiers", name, title, run, PUBLISHED_IDS, intrusive=name != "telemetry")
 
 
@@ -152,7 +156,7 @@ def _lengths(unit: Unit, sizes: Callable[[str], range]) -> Iterator[Case[LinkPro
             "empty": b"" if row.min_size > 1 else None,
         }
         for why, data in tried.items():
-            if data is not None and len(data) in sizes(row.klass):
+            if data is not None and len(data) in sizes(row.message_class):
                 title = f"{row.name} with {len(data)} bytes ({why}) is refused for its length"
                 run = partial(_refused, row, data, INVALID_LENGTH, None)
                 yield case_in("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
@@ -377,7 +381,9 @@ def _unsolicited(unit: Unit) -> Iterator[Case[LinkProbe]]:
 
 def _of_row(row: Row, answers: list[Answer]) -> list[Answer]:
     """Return the messages of a row, whose values must be within their limits."""
-    found = [answer for answer in answers if (answer.row_id, answer.klass) == (row.id, row.klass)]
+    found = [
+        answer for answer in answers if (answer.row_id, answer.message_class) == (row.id, row.message_class)
+    ]
     for answer in found:
         check_equal(len(answer.data), row.size, f"bytes of {row.name}")
         checked_values(row, answer.data)
@@ -432,9 +438,11 @@ def _check_carried(probe: LinkProbe) -> None:
 def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
     for row in unit.telecommands.values():
         fields = [name for name, item in row.named.items() if (item.argument or "").startswith("telemetry[")]
-        klass = str(row.arguments.get("class", ""))
+        message_class = str(row.arguments.get("class", ""))
         offered = [
-            item for item in unit.telemetry.values() if klass in ("", item.klass) and item.unsolicited is None
+            item
+            for item in unit.telemetry.values()
+            if message_class in ("", item.message_class) and item.unsolicited is None
         ][:2]
         if row.action == "subscribe" and fields and offered:
             title = f"{row.name} starts and stops unsolicited telemetry"
@@ -461,8 +469,12 @@ def _subscribe(command: Row, fields: list[str], offered: list[Row], probe: LinkP
         """Return the messages that the list has caused, not those that the unit always sends."""
         seen = probe.receive_unsolicited(seconds)
         probe.check_numbers(seen)
-        always = {(row.id, row.klass) for row in probe.unit.telemetry.values() if row.unsolicited is not None}
-        return [answer for answer in seen if (answer.row_id, answer.klass) not in always]
+        always = {
+            (row.id, row.message_class)
+            for row in probe.unit.telemetry.values()
+            if row.unsolicited is not None
+        }
+        return [answer for answer in seen if (answer.row_id, answer.message_class) not in always]
 
     chosen = none | {name: row.id for name, row in zip(fields, offered, strict=False)}
     probe.send_command(command, command.encode(chosen))
@@ -472,7 +484,11 @@ def _subscribe(command: Row, fields: list[str], offered: list[Row], probe: LinkP
     wanted = {(row.id, row.size) for row in offered[: len(fields)]}
     check(len(seen) >= len(wanted), "a message of each row within 3 s", f"{len(seen)} messages")
     check_equal({(answer.row_id, len(answer.data)) for answer in seen}, wanted, "rows and sizes")
-    check_equal({answer.klass for answer in seen} - {""}, {row.klass for row in offered} - {""}, "classes")
+    check_equal(
+        {answer.message_class for answer in seen} - {""},
+        {row.message_class for row in offered} - {""},
+        "classes",
+    )
     for answer in seen:
         checked_values(next(row for row in offered if row.id == answer.row_id), answer.data)
     check_equal(len(of_list(2.0)), 0, "messages after the end of the subscription")

@@ -170,7 +170,7 @@ class LifeGenerator:
         ]
         self._count_rows = self._reporting(COUNTING)
         self._effects = {
-            (row.klass, row.id, row.kind): self._reporting(EFFECTS.get(row.action or "", ()))
+            (row.message_class, row.id, row.kind): self._reporting(EFFECTS.get(row.action or "", ()))
             for row in self._telecommands
         }
         """Rows that report the effect of a telecommand."""
@@ -247,10 +247,14 @@ class LifeGenerator:
         return {"do": "wait", "s": round(self._random.uniform(*LONG_WAIT_S), 3), "most": most}
 
     def _request(self, row: Row, data: bytes = b"") -> Step:
-        return self._raw_request(row.klass, row.id, row.kind, data)
+        return self._raw_request(row.message_class, row.id, row.kind, data)
 
-    def _raw_request(self, klass: str, row_id: int, kind: str, data: bytes) -> Step:
-        step: Step = {"do": "request", "link": self._random.choice(self._links), "row": [klass, row_id, kind]}
+    def _raw_request(self, message_class: str, row_id: int, kind: str, data: bytes) -> Step:
+        step: Step = {
+            "do": "request",
+            "link": self._random.choice(self._links),
+            "row": [message_class, row_id, kind],
+        }
         return {**step, "data": data.hex()} if data else step
 
     def _read_any(self) -> Step:
@@ -327,7 +331,7 @@ class LifeGenerator:
     def _burst(self) -> Step:
         rows = [self._random.choice(self._telemetry) for _ in range(self._random.randint(2, 6))]
         link = self._random.choice([link for link in self._links if link != "canopen"] or self._links[:1])
-        return {"do": "burst", "link": link, "rows": [[row.klass, row.id, row.kind] for row in rows]}
+        return {"do": "burst", "link": link, "rows": [[row.message_class, row.id, row.kind] for row in rows]}
 
     # --- values ---
 
@@ -386,14 +390,16 @@ class LifeGenerator:
         match self._random.randrange(3):
             case 0:
                 on_wire = any(item.code is not None for item in self._definition.classes)
-                known = {other.id for other in rows if not on_wire or other.klass == row.klass}
+                known = {
+                    other.id for other in rows if not on_wire or other.message_class == row.message_class
+                }
                 unknown = [number for number in range(256) if number not in known]
                 number = self._random.choice(unknown) if unknown else row.id
                 kind = row.kind
                 if not self._definition.classes:
                     is_telemetry = self._definition.is_telemetry("", number)
                     kind = "telemetry" if is_telemetry else "telecommand"
-                return self._raw_request(row.klass, number, kind, b"")
+                return self._raw_request(row.message_class, number, kind, b"")
             case 1:
                 size = row.size if row.kind == "telecommand" else 0
                 # one byte more may be a CRC

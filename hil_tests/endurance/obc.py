@@ -113,7 +113,7 @@ class Obc:
             if not self._oracle.bursts:
                 raise Violation(f"{link}: a packet of a file that nobody requested")
             return
-        row = self._definition.by_key.get((event.klass, event.row_id or 0))
+        row = self._definition.by_key.get((event.message_class, event.row_id or 0))
         if event.kind != "unsolicited":
             raise Violation(f"{link}: {event} without a request")
         if row is None or row.kind != "telemetry":
@@ -130,9 +130,9 @@ class Obc:
 
     async def request(self, link: str, row: Sequence[Any], data: str = "") -> None:
         """Send a request, data in hexadecimal, and judge the answers."""
-        klass, row_id, kind = row
-        request = Request(row_id, bytes.fromhex(data), klass, telemetry=kind == "telemetry")
-        known = self._definition.by_key.get((klass, row_id))
+        message_class, row_id, kind = row
+        request = Request(row_id, bytes.fromhex(data), message_class, telemetry=kind == "telemetry")
+        known = self._definition.by_key.get((message_class, row_id))
         if known is not None and known.kind != kind:
             known = None
         if link == "canopen" and not self._in_dictionary(known, request):
@@ -231,7 +231,9 @@ class Obc:
         elif not replies:
             if expected and verdict == "ok":
                 yield "no answer"
-            refusable = (line is None or line.envelope.can_refuse(request.klass)) and not self._fixed_framing
+            refusable = (
+                line is None or line.envelope.can_refuse(request.message_class)
+            ) and not self._fixed_framing
             if expected and verdict is not None and refusable:
                 yield "no answer, must be refused"
         elif expected != ("echo",) and verdict not in (None, "ok"):
@@ -271,7 +273,7 @@ class Obc:
 
     def _read(self, what: str, row: Row | None, request: Request, reply: Answer) -> None:
         number = request.id if reply.row_id is None else reply.row_id
-        other = self._definition.by_key.get((reply.klass or request.klass, number)) or row
+        other = self._definition.by_key.get((reply.message_class or request.message_class, number)) or row
         named = set() if row is None else {item.partition(":")[2] or row.name for item in row.answers}
         if other is None or other.kind != "telemetry" or other.name not in named:
             raise Violation(f"{what}: {reply}")
@@ -284,7 +286,7 @@ class Obc:
         """Send telemetry requests without waiting; the answers come in order."""
         if link == "canopen" or self._oracle.stuck or link in self._oracle.disturbed:
             return
-        known = [self._definition.by_key[klass, row_id] for klass, row_id, _ in rows]
+        known = [self._definition.by_key[message_class, row_id] for message_class, row_id, _ in rows]
         asked = [row for row in known if self._oracle.verdict(row, self._definition.request(row)) == "ok"]
         self._outcome.requests += len(asked)
         self._ports[link].ask(*(self._definition.request(row) for row in asked))

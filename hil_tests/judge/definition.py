@@ -116,18 +116,18 @@ class Unit:
     @cached_property
     def by_key(self) -> Mapping[tuple[str, int], Row]:
         """Rows by class and ID."""
-        return {(row.klass, row.id): row for row in self.rows}
+        return {(row.message_class, row.id): row for row in self.rows}
 
     def row(self, request: Request) -> Row | None:
         """Return the row of a request; without a class, the first row with its ID."""
-        found = self.by_key.get((request.klass, request.id))
-        if found is None and not request.klass:
+        found = self.by_key.get((request.message_class, request.id))
+        if found is None and not request.message_class:
             found = next((row for row in self.rows if row.id == request.id), None)
         return found
 
-    def is_telemetry(self, klass: str, row_id: int) -> bool:
+    def is_telemetry(self, message_class: str, row_id: int) -> bool:
         """Return whether an ID, which need not belong to a row, is telemetry."""
-        kind = next((item.kind for item in self.classes if item.name == klass), None)
+        kind = next((item.kind for item in self.classes if item.name == message_class), None)
         if kind is not None:
             return str(kind.value) == "telemetry"
         if self.first_telemetry_id is not None:
@@ -165,11 +165,11 @@ class Unit:
                     found[command.name, row.name] = command, row, places
         return tuple(found.values())
 
-    def request(self, row: Row | int, data: bytes = b"", klass: str = "") -> Request:
+    def request(self, row: Row | int, data: bytes = b"", message_class: str = "") -> Request:
         """Return the request for a row, or for an ID, which need not belong to one."""
         if isinstance(row, int):
-            return Request(row, data, klass, self.is_telemetry(klass, row))
-        return Request(row.id, data, row.klass, row.is_telemetry)
+            return Request(row, data, message_class, self.is_telemetry(message_class, row))
+        return Request(row.id, data, row.message_class, row.is_telemetry)
 
     def code(self, error: str) -> int:
         """Return the unit's number for an error."""
@@ -222,7 +222,7 @@ def _parameter(item: Any) -> Parameter:
 
 def _row(row: Any, icd: InterfaceDefinition) -> Row:
     return Row(
-        row.kind, row.id, row.name, tuple(_fields(row, icd)), row.klass, row.provenance, row.source, row.action, row.arguments,
+        row.kind, row.id, row.name, tuple(_fields(row, icd)), row.message_class, row.provenance, row.source, row.action, row.arguments,
         row.answers, row.request, row.unsolicited, row.only_sent, row.min_size,
     )  # fmt: skip
 

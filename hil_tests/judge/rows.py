@@ -292,7 +292,7 @@ class Row:
     id: int
     name: str
     fields: tuple[Field, ...]
-    klass: str = ""
+    message_class: str = ""
     provenance: str = "ours"
     source: str = ""
     action: str | None = None

@@ -368,7 +368,7 @@ class Row(RowKeys):
     fields: tuple[Field, ...]
     """All fields in wire order, unused ones included."""
     slots: tuple[Slot, ...]
-    klass: str = ""
+    message_class: str = ""
     """Name of the row's class, if the unit has classes."""
     answers: tuple[str, ...] = ("reply",)
     """Answers in order: `echo`, `reply`, `row:NAME`."""

@@ -175,7 +175,7 @@ class RowModel(RowKeys):
     last_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
     """Expands to the rows name_1 … with the IDs `id` to `last_id` and the same layout; `[n]` is the number of
     the row. A unit has at most 65536 rows."""
-    klass: str | None = Field(default=None, alias="class")
+    message_class: str | None = Field(default=None, alias="class")
     """Class of the row; required if the unit has several classes of its kind."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Expected size of the data in bytes; the fields are checked against it."""

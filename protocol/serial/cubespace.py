@@ -122,7 +122,7 @@ class DialectReplies:
             raise ProtocolError(f"serial dialect {self._dialect} has no {reply.kind.value} messages{remedy}")
         data = b"" if reply.kind in (ReplyKind.ACK, ReplyKind.NACK) else reply.data
         values = {"id": reply.id or 0, "status": int(reply.code)}
-        return self.framing.encode(header.pack(values, reply.klass, len(data)) + data)
+        return self.framing.encode(header.pack(values, reply.message_class, len(data)) + data)
 
     def decode(self, body: bytes, pending: Request | None, reply_size: int) -> Reply | LinkFault:
         """Return the reply in a body, whose kind follows from its start byte, row and size.
@@ -160,7 +160,13 @@ class DialectReplies:
                 return LinkFault(FaultKind.UART_PROTOCOL, f"{name} {row_id} has {codes} bytes, must be 1")
             code = error_code(body[-1])
             kind = ReplyKind.NACK if code else kind
-        return Reply(kind, row_id, data, code, klass=pending.klass if known and pending is not None else "")
+        return Reply(
+            kind,
+            row_id,
+            data,
+            code,
+            message_class=pending.message_class if known and pending is not None else "",
+        )
 
     def _is_burst(self, body: bytes, pending: Request | None, reply_size: int) -> bool:
         size, place = self._sizes[ReplyKind.BURST] + BURST_SIZE, self._ids[ReplyKind.BURST]

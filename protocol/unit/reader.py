@@ -341,14 +341,14 @@ class _Reader:
         ids = self._ids_of(model)
         self._check_kind(kind, model)
         of_kind = [item.name for item in self._classes.values() if item.kind is kind]
-        klass = model.klass or next(iter(of_kind), "")
+        message_class = model.message_class or next(iter(of_kind), "")
         with self._recording(where):
             self._check_class(kind, model, of_kind)
         answers = model.answer
-        if klass not in self._classes:
-            klass = ""
+        if message_class not in self._classes:
+            message_class = ""
         elif answers is None:
-            answers = self._classes[klass].answer
+            answers = self._classes[message_class].answer
         single = model.last_id is None
         errors = len(self.errors)
         for number, row_id in enumerate(ids, 1):
@@ -379,7 +379,7 @@ class _Reader:
                 doc=model.doc,
                 provenance=provenance,
                 source=model.source or (self._unit.source if provenance == "confirmed" else ""),
-                klass=klass,
+                message_class=message_class,
                 action=model.action,
                 unsolicited=model.unsolicited,
                 arguments={
@@ -414,10 +414,10 @@ class _Reader:
 
     def _check_class(self, kind: RequestKind, model: schema.RowModel, of_kind: list[str]) -> None:
         """Raise IcdError if a row lacks its class, or names a wrong one."""
-        if model.klass is not None:
-            found = _find("class", model.klass, self._classes)
+        if model.message_class is not None:
+            found = _find("class", model.message_class, self._classes)
             if found.kind is not kind:
-                raise IcdError(f"class {model.klass} is for {found.kind}, not for {kind}")
+                raise IcdError(f"class {model.message_class} is for {found.kind}, not for {kind}")
         elif (len(of_kind) > 1 or (self._classes and not of_kind)) and CLASS not in self._broken:
             raise IcdError(f"needs `class`, one of {', '.join(of_kind or self._classes)}")
 
@@ -431,7 +431,7 @@ class _Reader:
             raise IcdError(f"ID {row.id} is above {highest}")
         if row.name in self._rows:
             raise IcdError("name used twice")
-        code = self._classes[row.klass].code if row.klass else None
+        code = self._classes[row.message_class].code if row.message_class else None
         if self._ids.setdefault((code, row.id), row.name) != row.name:
             raise IcdError(f"ID {row.id} is already used by {self._ids[code, row.id]}")
 
@@ -442,10 +442,12 @@ class _Reader:
                 continue
             name, row_id = table.get("name"), table["id"]
             of_kind = [item.name for item in self._classes.values() if item.kind is kind]
-            klass = self._classes.get(str(table.get("class", of_kind[0] if len(of_kind) == 1 else "")))
-            if self._classes and klass is None:
+            message_class = self._classes.get(
+                str(table.get("class", of_kind[0] if len(of_kind) == 1 else ""))
+            )
+            if self._classes and message_class is None:
                 continue
-            used = self._ids.get((None if klass is None else klass.code, row_id), name)
+            used = self._ids.get((None if message_class is None else message_class.code, row_id), name)
             if used != name:
                 self.errors.append(f"{file}: {kind} {name}: ID {row_id} is already used by {used}")
 
@@ -519,7 +521,7 @@ def _check_link(icd: InterfaceDefinition) -> None:
     stack = SerialStack(icd)
     for row in icd.rows:
         with Located(f"{row.kind} {row.name}"):
-            text_form = stack.request_formats.of(row.klass) in stack.text_formats
+            text_form = stack.request_formats.of(row.message_class) in stack.text_formats
             check_text_request(row, icd, needed=text_form)
 
 

@@ -100,8 +100,8 @@ def _constants(stack: SerialStack) -> dict[str, str]:
 
 def _rows(stack: SerialStack) -> dict[str, Any]:
     """Return the functions of a row's key: tests of its kind, and its sizes."""
-    rows = {row_key(stack.classes, row.klass, row.id): row for row in stack.rows}
-    headers = {key: stack.requests.header.size(row.klass) for key, row in rows.items()}
+    rows = {row_key(stack.classes, row.message_class, row.id): row for row in stack.rows}
+    headers = {key: stack.requests.header.size(row.message_class) for key, row in rows.items()}
     requests = {key: headers[key] + row.request_size + stack.requests.check.size for key, row in rows.items()}
     return {
         "tests": {
