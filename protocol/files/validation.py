@@ -83,7 +83,7 @@ def problems(
         Number of errors that are examined, at least `MAX_PROBLEMS`; for each further one there is an empty problem.
         Default: all.
     """
-    found: dict[tuple[int | str, ...], tuple[ErrorDetails, Callable[[bool], list[str]]]] = {}
+    reports: dict[tuple[int | str, ...], tuple[ErrorDetails, Callable[[bool], list[str]]]] = {}
     above: set[tuple[int | str, ...]] = set()
     items = error.errors(include_url=False)
     for item in items[:most]:
@@ -100,10 +100,10 @@ def problems(
             say = partial(_choice, item, models)
         if document is not None:
             location = _in(document, location, absent=item["type"] in _ABSENT)
-        found.setdefault(location, (item, say))  # an alternative of a union may have been reported
+        reports.setdefault(location, (item, say))  # an alternative of a union may have been reported
         above.update(location[:count] for count in range(len(location)))
     written = 0
-    for location, (item, say) in found.items():
+    for location, (item, say) in reports.items():
         if item["type"] in _NEEDED and location in above:
             continue  # another alternative has the right type, and errors in it
         key = _dotted(document, location)
@@ -133,7 +133,7 @@ def _texts(item: ErrorDetails, suggest: bool) -> list[str]:
 
 def wording(item: ErrorDetails, *, suggest: bool = True) -> str:
     """Return the problem and what is needed instead, such as `must be at least 1 (given: 0)`."""
-    kind, context, given = item["type"], item.get("ctx", {}), item["input"]
+    kind, context, value = item["type"], item.get("ctx", {}), item["input"]
     if kind == "missing":
         return "missing"
     if kind in _LIMITS:
@@ -141,8 +141,8 @@ def wording(item: ErrorDetails, *, suggest: bool = True) -> str:
         text = f"must be {words} {context[key]:g}"
     elif kind == "literal_error":
         allowed = context["expected"].replace(" or ", ", ")
-        names = re.findall("'([^']*)'", allowed) if suggest and isinstance(given, str) else ()
-        return f"must be one of {allowed} (given: {given!r}){did_you_mean(str(given), names)}"
+        names = re.findall("'([^']*)'", allowed) if suggest and isinstance(value, str) else ()
+        return f"must be one of {allowed} (given: {value!r}){did_you_mean(str(value), names)}"
     elif kind in ("too_short", "too_long"):
         words, limit = ("at least", "min_length") if kind == "too_short" else ("at most", "max_length")
         number = context["actual_length"]
@@ -152,11 +152,11 @@ def wording(item: ErrorDetails, *, suggest: bool = True) -> str:
     else:
         message = item["msg"].removeprefix("Value error, ")
         text = f"{message[:1].lower()}{message[1:]}"
-    quoted = isinstance(given, str) and repr(given) in text
+    quoted = isinstance(value, str) and repr(value) in text
     return (
         text
-        if quoted or isinstance(given, (dict, list)) or kind == "json_invalid"
-        else f"{text} (given: {given!r})"
+        if quoted or isinstance(value, (dict, list)) or kind == "json_invalid"
+        else f"{text} (given: {value!r})"
     )
 
 

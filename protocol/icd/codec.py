@@ -431,14 +431,14 @@ class Row(RowKeys):
 
         Raises FieldError: a value is invalid; the text names row.field, the value and the allowed values.
         """
-        given = {} if values is None else values
-        unknown = given.keys() - self.named_fields.keys()
+        by_name = {} if values is None else values
+        unknown = by_name.keys() - self.named_fields.keys()
         if unknown:
             name = min(unknown)
             raise FieldError(f"{self.name}.{name}: no such field{remedy(name, self.named_fields)}")
         raw: list[Any] = [b"" if slot.type == "bytes" else 0 for slot in self.slots]
         for index, (name, item) in enumerate(self.named_fields.items()):
-            value = given.get(name)
+            value = by_name.get(name)
             if value is None:
                 if self.kind == "telecommand" and item.required:
                     raise FieldError(f"{self.name}.{name}: missing value", index=index)
@@ -464,7 +464,7 @@ class Row(RowKeys):
         if not self.min_size <= len(data) <= self.size:
             wanted = f"{self.min_size} to {self.size}" if self.min_size < self.size else f"{self.size}"
             raise LengthError(f"{self.kind} {self.name} ({self.id}): {len(data)} bytes, must be {wanted}")
-        given, data = len(data), data.ljust(self.size, b"\0")
+        size, data = len(data), data.ljust(self.size, b"\0")
         strict = self.kind == "telecommand" if check is None else check
         raw: list[Any] = []
         offset = 0
@@ -476,10 +476,10 @@ class Row(RowKeys):
         values: dict[str, Value] = {}
         for index, (name, item) in enumerate(self.named_fields.items()):
             number = raw[item.slot.index]
-            if item.slot.offset + item.slot.size > given:
-                if item.kind != "bytes" or item.slot.offset > given:
+            if item.slot.offset + item.slot.size > size:
+                if item.kind != "bytes" or item.slot.offset > size:
                     continue
-                number = number[: given - item.slot.offset]
+                number = number[: size - item.slot.offset]
             if item.width:
                 number = number >> item.shift & (1 << item.width) - 1
             if strict:

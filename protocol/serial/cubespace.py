@@ -136,10 +136,10 @@ class DialectReplies:
         if kinds is None:
             text = f"message {body[1]} with the start byte of a request"
             return LinkFault(FaultKind.UART_PROTOCOL, text)
-        known = pending is not None
+        is_awaited = pending is not None
         if kinds[0] in self._ids:
             row_id = body[self._ids[kinds[0]]]
-            known = pending is not None and pending.id == row_id
+            is_awaited = pending is not None and pending.id == row_id
         elif pending is not None:
             row_id = pending.id
         else:
@@ -150,7 +150,7 @@ class DialectReplies:
             kind = ReplyKind.ACK
         else:
             coded = ReplyKind.NACK in kinds and len(body) == sizes[ReplyKind.NACK]
-            kind = ReplyKind.NACK if coded and known and reply_size != 1 else ReplyKind.TELEMETRY
+            kind = ReplyKind.NACK if coded and is_awaited and reply_size != 1 else ReplyKind.TELEMETRY
         data = body[sizes[kind] :]
         code: ErrorCode | int = ErrorCode.OK
         if kind in self._coded:
@@ -165,7 +165,7 @@ class DialectReplies:
             row_id,
             data,
             code,
-            message_class=pending.message_class if known and pending is not None else "",
+            message_class=pending.message_class if is_awaited and pending is not None else "",
         )
 
     def _is_burst(self, body: bytes, pending: Request | None, reply_size: int) -> bool:

@@ -85,12 +85,12 @@ class HeaderCodec:
 
     def size(self, message_class: str) -> int:
         """Return the size of the header in messages of a class."""
-        found = self._sizes.get(message_class)
-        if found is None:
-            found = self._sizes[message_class] = sum(
+        size = self._sizes.get(message_class)
+        if size is None:
+            size = self._sizes[message_class] = sum(
                 field.size for field in self.fields if field.in_class(message_class)
             )
-        return found
+        return size
 
     def count_ns(self, role: str) -> int:
         """Return the nanoseconds per count of `ticks` or `time`."""
@@ -156,11 +156,11 @@ class HeaderCodec:
             if role is not None:
                 values[role] = value
             for name, shift, mask, required, _ in bits:
-                found = value >> shift & mask
-                if required is not None and found != required:
-                    raise HeaderError(f"header has bits {found:#x}, expected {required:#x}")
+                field_bits = value >> shift & mask
+                if required is not None and field_bits != required:
+                    raise HeaderError(f"header has bits {field_bits:#x}, expected {required:#x}")
                 if name is not None:
-                    values[name] = found
+                    values[name] = field_bits
             if not message_class and "class" in values:
                 if values["class"] not in self._classes:
                     raise HeaderError(f"no class with code {values['class']}")

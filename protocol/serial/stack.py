@@ -109,18 +109,18 @@ class SerialStack:
 
     def _formats_of(self, direction: str, models: Sequence[HeaderFieldModel]) -> Formats:
         """Return the formats of a direction; one of classes that have no messages in it is left out."""
-        found = []
+        formats = []
         names = {*self.classes} or {""}
         left = {name for name in names if self._has_messages(name, direction, models)}
         for number, item in enumerate(self.link.format, 1):
             self._check_format(item, f"link.serial.format {number}")
             used = item.classes is None or not left.isdisjoint(item.classes)
             if item.direction in (None, direction) and used:
-                found.append(self._format(f"{direction}_header", models, item))
+                formats.append(self._format(f"{direction}_header", models, item))
                 left.difference_update(item.classes or ())
-        if not found or (left and all(form.classes for form in found)):
-            found.append(self._format(f"{direction}_header", models))
-        return Formats(found, direction)
+        if not formats or (left and all(form.classes for form in formats)):
+            formats.append(self._format(f"{direction}_header", models))
+        return Formats(formats, direction)
 
     def _has_messages(self, message_class: str, direction: str, models: Sequence[HeaderFieldModel]) -> bool:
         """Return whether there are requests, or replies and refusals, of rows of a class."""
@@ -522,23 +522,23 @@ def default_dialect(dialects: Sequence[Dialect]) -> Dialect | None:
     return dialects[0] if len(dialects) == 1 else Dialect.B if dialects else None
 
 
-def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | None:
+def chosen_dialect(icd: InterfaceDefinition, name: str | None) -> Dialect | None:
     """Return the dialect of serial replies of a unit; None if it has no dialects.
 
     Parameters
     ----------
     icd
         Definition of the unit.
-    wanted
+    name
         The user's choice; None for the default: the only dialect of the unit, otherwise b.
 
     Raises IcdError: the unit does not have this dialect.
     """
     dialects = dialects_of(icd.link.serial)
-    if wanted is None:
+    if name is None:
         return default_dialect(dialects)
     if not dialects:
         raise IcdError(f"unit {icd.name} has no reply dialects; do not select one")
-    if wanted not in dialects:
+    if name not in dialects:
         raise IcdError(f"unit {icd.name} has only dialect {', '.join(dialects)}; do not select another")
-    return Dialect(wanted)
+    return Dialect(name)

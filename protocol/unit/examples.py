@@ -64,7 +64,7 @@ def served(icd: InterfaceDefinition) -> tuple[list[str], list[Exchange]]:
     errors = _unserved_rows(icd)
     if errors:
         return errors, []
-    found: list[Exchange] = []
+    exchanges: list[Exchange] = []
     failed: dict[str, list[Row]] = {}
     for row, link, example in _examples(icd):
         try:
@@ -74,7 +74,7 @@ def served(icd: InterfaceDefinition) -> tuple[list[str], list[Exchange]]:
             for text in error.args:
                 failed.setdefault(text, []).append(row)
         else:
-            found += [] if exchange is None else [exchange]
+            exchanges += [] if exchange is None else [exchange]
     for text, rows in failed.items():
         more = len(rows) - 1
         errors.append(
@@ -85,7 +85,7 @@ def served(icd: InterfaceDefinition) -> tuple[list[str], list[Exchange]]:
             build_eds(DeviceDictionary(icd))
         except ProtocolError as error:
             errors += error.args
-    return errors, found
+    return errors, exchanges
 
 
 def _unserved_rows(icd: InterfaceDefinition) -> list[str]:
@@ -221,12 +221,12 @@ def _check_framing(stack: SerialStack, row: Row, request: Request, line: bytes) 
     received = guarded(name, stack.device().feed)(line, 0.0)
     requests = [(item.message_class, item.id, item.data) for item in received if isinstance(item, Request)]
     if requests != [(row.message_class, row.id, request.data)]:
-        seen = [item.detail for item in received if isinstance(item, LinkFault)]
-        seen += [
+        returned = [item.detail for item in received if isinstance(item, LinkFault)]
+        returned += [
             f"a request for {message_class} {row_id}".replace("  ", " ")
             for message_class, row_id, _ in requests
         ]
-        instead = "" if own else f"; it returns: {'; '.join(seen) or 'nothing'}"
+        instead = "" if own else f"; it returns: {'; '.join(returned) or 'nothing'}"
         raise IcdError(f"{name} does not return the request that it encoded{instead}")
 
 

@@ -165,11 +165,11 @@ class Layout:
         self, model: FieldModel | BitModel, limits: tuple[int, int] | None, described: str
     ) -> Iterator[str]:
         """Yield what is wrong with the parameter and the numbers of a field."""
-        name, known = model.parameter, self._icd.device_parameters
-        if name is not None and name not in known:
-            yield f"no parameter named {name!r}{did_you_mean(name, known)}"
-        elif name is not None and known[name].unit != model.unit:
-            yield f"unit {model.unit!r}, but parameter {name} is in {known[name].unit!r}; they must agree"
+        name, parameters = model.parameter, self._icd.device_parameters
+        if name is not None and name not in parameters:
+            yield f"no parameter named {name!r}{did_you_mean(name, parameters)}"
+        elif name is not None and parameters[name].unit != model.unit:
+            yield f"unit {model.unit!r}, but parameter {name} is in {parameters[name].unit!r}; they must agree"
         if abs(model.scale) < SMALLEST_SCALE:
             yield f"scale {model.scale:g} is smaller than {SMALLEST_SCALE:g}"
             return
@@ -237,12 +237,12 @@ def enum_of(name: str | None, icd: InterfaceDefinition) -> EnumDefinition:
     """Return an enumeration of the unit or, if it has none of this name, of the device model."""
     if name is None:
         raise IcdError("type enum needs `enum`, the name of an enumeration")
-    found = icd.enums.get(name) or icd.model.enums.get(name)
-    if found is None:
-        known = sorted({*icd.enums, *icd.model.enums})
-        near = did_you_mean(name, known)
-        raise MissingNameError(f"no enumeration named {name!r}{near} (known: {', '.join(known)})", name)
-    return found
+    enum = icd.enums.get(name) or icd.model.enums.get(name)
+    if enum is None:
+        names = sorted({*icd.enums, *icd.model.enums})
+        near = did_you_mean(name, names)
+        raise MissingNameError(f"no enumeration named {name!r}{near} (known: {', '.join(names)})", name)
+    return enum
 
 
 def _expanded(model: FieldModel, number: int | None) -> Iterator[tuple[FieldModel, str, int | None]]:
@@ -285,12 +285,12 @@ def mapped(table: Mapping[str, Scalar | list[Scalar]]) -> tuple[EnumDefinition, 
     """Return the enumeration of a `map`, and the values that are sent as another member."""
     values: dict[str, int] = {}
     aliases: dict[str, str] = {}
-    for wire, given in table.items():
+    for wire, targets in table.items():
         try:
             number = int(wire, 0)
         except ValueError:
             raise IcdError(f'map: {wire!r} is not a number on the wire; write "1" = "tracking"') from None
-        names = [text_of(value) for value in (given if isinstance(given, list) else [given])]
+        names = [text_of(value) for value in (targets if isinstance(targets, list) else [targets])]
         if not names or any(name in values or name in aliases for name in names):
             raise IcdError(f"map: {wire}: no value, or a duplicate one")
         values[names[0]] = number

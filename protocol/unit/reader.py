@@ -148,17 +148,17 @@ class _Reader:
             self.errors.append(f"{file}: not valid TOML: {error}")
             self._unread = True
             return
-        said = False
+        is_reported = False
         while True:
             try:
                 tables = schema.FileModel.model_validate(document)
                 break
             except ValidationError as error:
-                found = list(problems(error, schema.FileModel, document))
-                if not said:  # later ones may be caused by what was removed
-                    self.errors += [f"{file}: {problem}" for problem in found]
-                said = True
-                places = sorted(map(_place, found), key=lambda place: [f"{step:>9}" for step in place])
+                faults = list(problems(error, schema.FileModel, document))
+                if not is_reported:  # later ones may be caused by what was removed
+                    self.errors += [f"{file}: {problem}" for problem in faults]
+                is_reported = True
+                places = sorted(map(_place, faults), key=lambda place: [f"{step:>9}" for step in place])
                 for place in reversed(dict.fromkeys(places)):  # from the last: the other indices stay
                     self._remove(file, document, place)
         for name, given in tables:
@@ -284,9 +284,9 @@ class _Reader:
         _add(self._classes, item.name, item)
 
     def _add_parameter(self, model: schema.ParameterModel) -> None:
-        known, device = self._icd.parameters, self._icd.model.parameters
-        same_id = next((other.name for other in known.values() if other.id == model.id), None)
-        if same_id is not None and model.name not in known:
+        parameters, device = self._icd.parameters, self._icd.model.parameters
+        same_id = next((other.name for other in parameters.values() if other.id == model.id), None)
+        if same_id is not None and model.name not in parameters:
             raise IcdError(f"ID {model.id} is already used by {same_id}")
         if model.name not in device:
             raise IcdError(f"the device has no parameter with this name{did_you_mean(model.name, device)}")
@@ -302,7 +302,7 @@ class _Reader:
         except FieldError as error:
             raise IcdError(f"default: {error}") from None
         parameter = parameter.model_copy(update={"default": default})
-        _add(known, model.name, parameter)
+        _add(parameters, model.name, parameter)
         self._icd.device_parameters[model.name] = parameter
 
     # --- rows ---
@@ -484,11 +484,11 @@ def _find(what: str, name: str, items: Mapping[str, _Item]) -> _Item:
 
 
 def _check_errors(errors: Mapping[str, int], conventions: Conventions) -> None:
-    known = [*(code.name.lower() for code in ErrorCode), OTHER_ERROR]
+    names = [*(code.name.lower() for code in ErrorCode), OTHER_ERROR]
     for name in errors:
-        if name not in known:
+        if name not in names:
             raise IcdError(
-                f"errors.{name}: no such error{did_you_mean(name, known)} (known: {', '.join(known)})"
+                f"errors.{name}: no such error{did_you_mean(name, names)} (known: {', '.join(names)})"
             )
     if "crc" in errors and not conventions.telecommand_crc:
         raise IcdError(
