@@ -244,7 +244,7 @@ class CanopenLink(Link[CanFrame]):
     def _receive(self, item: CanFrame) -> None:
         if not item.extended and not self._device.unresponsive:
             if item.id == SDO_RECEIVE + self.slave.node_id:
-                self.heard.count()
+                self.obc_requests.count()
             self._run_action(partial(self.slave.receive, item))
 
     def _run_action(self, action: Action) -> None:

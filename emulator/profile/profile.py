@@ -173,7 +173,7 @@ ALTERNATIVES: Final = (
 CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"})
 """Device parameters that describe the camera; by default, the device is calibrated exactly."""
 
-OF_CAMERA: Final = CALIBRATION | {"limiting_magnitude"}
+CAMERA_PARAMETERS: Final = CALIBRATION | {"limiting_magnitude"}
 """Device parameters that are not inherited by a profile with another camera."""
 
 PATHS: Final = profile_paths(Profile)
@@ -183,13 +183,13 @@ _LONGEST_SHOWN: Final = 200
 """Longest part of a `--set` that an error repeats before it says what is wrong with it, characters."""
 
 _A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
-OF_FAULTS: Final = dict.fromkeys(
+FAULT_KEY_HINTS: Final = dict.fromkeys(
     ("fault", "faults", "optical", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
      "delay_s", "split", "gap_s"),
     _A_FAULT,
 )  # fmt: skip
 """Keys of faults, which a profile does not have, and the hint for whoever writes one there."""
-OF_ATTITUDES: Final = {
+ATTITUDE_KEY_HINTS: Final = {
     key: f"; did you mean attitude.{key}?" for key in ("ra_deg", "dec_deg", "roll_deg", "quaternion_xyzw")
 }
 """Keys of an attitude, and the hint for whoever writes one outside its table."""
@@ -215,7 +215,9 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
-        listed = problems(error, Profile, values, also=("extends",), hints=OF_FAULTS | OF_ATTITUDES)
+        listed = problems(
+            error, Profile, values, also=("extends",), hints=FAULT_KEY_HINTS | ATTITUDE_KEY_HINTS
+        )
         found += [(problem.location, str(problem)) for problem in listed]
     name = str(values.get("unit", DEFAULT_UNIT))
     unit = _path_of_unit(name, path.parent)
@@ -353,7 +355,9 @@ def _drop_parameters_of_camera(values: dict[str, Any]) -> None:
     values.pop("calibration", None)
     parameters = values.get("parameters")
     if isinstance(parameters, dict):
-        values["parameters"] = {key: value for key, value in parameters.items() if key not in OF_CAMERA}
+        values["parameters"] = {
+            key: value for key, value in parameters.items() if key not in CAMERA_PARAMETERS
+        }
 
 
 def _replaced_by(given: Iterable[str]) -> set[str]:

@@ -191,8 +191,8 @@ class AsyncObcClient:
 
         Messages received before `since_s` (on `time.monotonic`) are dropped.
         """
-        wanted = self.icd.telemetry[name].name
-        queue = self.unsolicited[wanted]
+        row_name = self.icd.telemetry[name].name
+        queue = self.unsolicited[row_name]
         limit = self.timeout_s if timeout_s is None else timeout_s
         try:
             async with asyncio.timeout(limit):
@@ -201,7 +201,7 @@ class AsyncObcClient:
                     if reading.received_s >= since_s:
                         return reading
         except TimeoutError:
-            raise NoReplyError(f"unsolicited {wanted}", limit) from None
+            raise NoReplyError(f"unsolicited {row_name}", limit) from None
 
     # --- by row ID ---
 

@@ -58,32 +58,32 @@ async def send_and_listen(
     client: AsyncObcClient,
     items: Sequence[bytes | CanFrame],
     listen_s: float,
-    wanted: Sequence[str] = (),
+    patterns: Sequence[str] = (),
     timeout_s: float | None = None,
 ) -> tuple[str, ...]:
     """Send bytes (serial) or frames (CAN), and return the answer as one text of bytes, or as frames.
 
     Listens for `listen_s`, and for up to `timeout_s` (default: that of the client) until as much has arrived as the
-    patterns in `wanted` have.
+    patterns in `patterns` have.
     """
     link = client.link
-    size = len("".join(wanted).replace("*", ""))
+    size = len("".join(patterns).replace("*", ""))
     end = time.monotonic() + (client.timeout_s if timeout_s is None else timeout_s)
-    seen: list[Any] = []
-    before, link.on_raw = link.on_raw, seen.append
+    received: list[Any] = []
+    before, link.on_raw = link.on_raw, received.append
     try:
         for item in items:
             link.send(item)
         await asyncio.sleep(listen_s)
-        while len("".join(_format_received(link, seen))) < size and time.monotonic() < end:
+        while len("".join(_format_received(link, received))) < size and time.monotonic() < end:
             await asyncio.sleep(_POLL_S)
     finally:
         link.on_raw = before
-    return _format_received(link, seen)
+    return _format_received(link, received)
 
 
-def _format_received(link: HostLink[Any], seen: list[Any]) -> tuple[str, ...]:
+def _format_received(link: HostLink[Any], received: list[Any]) -> tuple[str, ...]:
     """Return one text of all bytes, or one per frame of the device."""
     if link.name == "serial":
-        return (b"".join(seen).hex().upper(),)
-    return tuple(str(frame) for frame in seen if link.is_from_device(frame))
+        return (b"".join(received).hex().upper(),)
+    return tuple(str(frame) for frame in received if link.is_from_device(frame))

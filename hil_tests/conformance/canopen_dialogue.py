@@ -167,28 +167,28 @@ Answer = Annotated[str, _answer]
 # --- holding a case ---
 
 
-def _check(seen: bytes | None, wanted: str) -> None:
+def _check(response: bytes | None, answer: str) -> None:
     """Check the answer to a request."""
-    kind, *details = wanted.split()
+    kind, *details = answer.split()
     match kind:
         case "silence":
-            check(seen is None, "no answer", seen or "an empty frame")
+            check(response is None, "no answer", response or "an empty frame")
         case "abort":
-            check_abort(seen, *_aborts(details[0]), multiplexer="".join(details[1:]))
+            check_abort(response, *_aborts(details[0]), multiplexer="".join(details[1:]))
         case "segment":
             number, *data = details
-            check(seen is not None, f"segment {number} of the block", seen)
-            check_equal((seen or b"\0")[0] & 0x7F, int(number), "segment number")
+            check(response is not None, f"segment {number} of the block", response)
+            check_equal((response or b"\0")[0] & 0x7F, int(number), "segment number")
             if data:
-                check_equal((seen or b"")[1:], bytes.fromhex("".join(data)), "data of the segment")
+                check_equal((response or b"")[1:], bytes.fromhex("".join(data)), "data of the segment")
         case "block":
-            check(seen is not None and seen[0] & 0xFB == 0xA0, "answer A0h or A4h", seen)
-            check_equal((seen or b"")[1:4].hex(), details[0], "multiplexer")
-            check(1 <= (seen or bytes(5))[4] <= 127, "block size 1 to 127", seen)
+            check(response is not None and response[0] & 0xFB == 0xA0, "answer A0h or A4h", response)
+            check_equal((response or b"")[1:4].hex(), details[0], "multiplexer")
+            check(1 <= (response or bytes(5))[4] <= 127, "block size 1 to 127", response)
         case "*" | "-":
             pass
         case _:
-            check_answer(seen, wanted)
+            check_answer(response, answer)
 
 
 class CanopenDialogue(Dialogue[CanopenProbe]):
@@ -247,19 +247,19 @@ class CanopenDialogue(Dialogue[CanopenProbe]):
         timeout_s = {"silence": 0.1, "-": 0.0}.get(answer, ANSWER_S)
         return self._judge(self._ask(bytes.fromhex("".join(words)), timeout_s), answer)
 
-    def _expect_frame(self, wanted: str) -> None:
-        data = self._probe.expect(int(wanted.partition("#")[0], 16), "frame")
-        check(_is_frame(wanted, data), f"frame {wanted}", data)
+    def _expect_frame(self, frame: str) -> None:
+        data = self._probe.expect(int(frame.partition("#")[0], 16), "frame")
+        check(_is_frame(frame, data), f"frame {frame}", data)
 
-    def _judge(self, seen: bytes | None, answer: str) -> bool:
+    def _judge(self, data: bytes | None, answer: str) -> bool:
         """Check an answer of the node; return whether the dialogue ends with it."""
         is_optional = answer.startswith("unless ")
-        if is_optional and seen is not None and seen[0] != ABORT:
+        if is_optional and data is not None and data[0] != ABORT:
             return False
         failures = []
-        for wanted in answer.removeprefix("unless ").split(" or "):
+        for alternative in answer.removeprefix("unless ").split(" or "):
             try:
-                _check(seen, wanted)
+                _check(data, alternative)
             except CaseFailed as failure:
                 failures.append(failure)
             else:
@@ -341,18 +341,18 @@ class CanopenDialogue(Dialogue[CanopenProbe]):
     def do_boot_up(self) -> None:
         self._probe.expect_boot_up()
 
-    def do_state(self, wanted: str) -> None:
-        check_equal(f"{self._probe.state():02x}", wanted, "state")
+    def do_state(self, state: str) -> None:
+        check_equal(f"{self._probe.state():02x}", state, "state")
 
     def do_node(self, number: Hex) -> None:
         self._probe.node = number
 
-    def do_guard(self, wanted: str = "") -> None:
+    def do_guard(self, states: str = "") -> None:
         can_id = HEARTBEAT + self._probe.node
         self._probe.send(can_id, remote=True)
-        if wanted:
+        if states:
             seen = self._probe.expect(can_id, "answer to node guarding").hex()
-            check(seen in wanted.split("|"), f"answer {wanted} to node guarding", seen)
+            check(seen in states.split("|"), f"answer {states} to node guarding", seen)
         else:
             self._probe.expect_silence(can_id, "answer to node guarding", 0.2)
 
@@ -438,10 +438,10 @@ class CanopenDialogue(Dialogue[CanopenProbe]):
 
     def do_map(self, index: Hex, kind: Number, *words: Objects) -> None:
         """Configure a PDO by the procedure of CiA 301; other PDOs and the heartbeat are off."""
-        probe, given = self._probe, dict(words)
+        probe, settings = self._probe, dict(words)
         objects = [number for name, number in words if not name]
         flags = NO_RTR if index >= TPDO else 0
-        can_id = flags | given.get("can_id", default_id(index, probe.node))
+        can_id = flags | settings.get("can_id", default_id(index, probe.node))
         probe.quiet()
         probe.set(index, 1, PDO_OFF | can_id)
         probe.set(index + 0x200, 0, 0, 1)
@@ -450,9 +450,9 @@ class CanopenDialogue(Dialogue[CanopenProbe]):
         probe.set(index + 0x200, 0, len(objects), 1)
         probe.set(index, 2, kind, 1)
         for subindex, setting, size in (
-            (3, given.get("inhibit", 0), 2),
-            (5, given.get("event_ms", 0), 2),
-            (6, given.get("start"), 1),
+            (3, settings.get("inhibit", 0), 2),
+            (5, settings.get("event_ms", 0), 2),
+            (6, settings.get("start"), 1),
         ):
             served = not probe.lacks(f"{index:x}:{subindex}")
             if setting and not served:
@@ -481,17 +481,17 @@ class CanopenDialogue(Dialogue[CanopenProbe]):
             return self._ask(data, 0.03) is not None
 
         check(ask(0, 0x80, 0, 0), "an answer to the start of Fastscan", None)
-        for part, wanted in enumerate(identity):
+        for part, value in enumerate(identity):
             number = 0
             for bit in reversed(range(32)):
                 number |= (not ask(number, bit, part, part)) << bit
-            check_equal(number.to_bytes(4, "little"), wanted, f"part {part + 1} of the identity")
+            check_equal(number.to_bytes(4, "little"), value, f"part {part + 1} of the identity")
             check(ask(number, 0, part, (part + 1) % 4), f"part {part + 1} of the identity confirmed", None)
 
 
-def _is_frame(wanted: str, data: bytes) -> bool:
+def _is_frame(frame: str, data: bytes) -> bool:
     """Return whether a frame with the CAN ID of a pattern has the data of the pattern."""
-    return matches(pattern(wanted).partition("#")[2], data.hex().upper())
+    return matches(pattern(frame).partition("#")[2], data.hex().upper())
 
 
 def dialogue_cases(path: Path) -> list[Case[CanopenProbe]]:

@@ -157,18 +157,18 @@ def _text(probe: CanopenProbe) -> dict[str, str]:
 
     With its second segment, and the largest threshold at which its block upload may become a segmented one.
     """
-    found: tuple[ODVariable, bytes] | None = None
+    text: tuple[ODVariable, bytes] | None = None
     for item in probe.variables():
         value = (
             probe.try_read(item.index, item.subindex) if item.data_type in TEXTS and item.readable else b""
         )
-        if isinstance(value, bytes) and len(value) >= (14 if found is None else 15):
-            found = item, value
+        if isinstance(value, bytes) and len(value) >= (14 if text is None else 15):
+            text = item, value
             if len(value) > 14:
                 break
-    if found is None:
+    if text is None:
         raise CaseSkipped("no readable text of 14 bytes or more")
-    item, value = found
+    item, value = text
     return {
         "text": _mux(item), "text_value": value.hex(), "text_size": len(value).to_bytes(4, "little").hex(),
         "text_second": value[7:14].hex(), "text_threshold": f"{min(255, len(value)):02x}",

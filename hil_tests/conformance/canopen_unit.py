@@ -71,11 +71,11 @@ def _argument(entry: Entry, name: str) -> Field | None:
 # --- telemetry ---
 
 
-def _rows(unit: Unit, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+def _rows(unit: Unit, entries: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     for row in unit.telemetry.values():
-        if not any(entry.row is row for entry in found):
+        if not any(entry.row is row for entry in entries):
             continue
-        read = {slot.offset for _, slot in slots(row, found)}
+        read = {slot.offset for _, slot in slots(row, entries)}
         fields = [item for item in row.named.values() if item.offset in read]
         attitude = AttitudeRow.of(row, unit.conventions, fields)
         title = f"the entries of {row.name} have the right sizes, and values within the limits"
@@ -183,12 +183,12 @@ def _reported(entry: Entry, command: Row, probe: CanopenProbe) -> None:
     probe.put(entry, before or b"\0")
 
 
-def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+def _records(entries: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     """Yield the cases for records whose entries together set one telecommand."""
     for command in {
-        entry.command.name: entry.command for entry in found if entry.command and entry.part
+        entry.command.name: entry.command for entry in entries if entry.command and entry.part
     }.values():
-        members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
+        members = [entry for entry in entries if entry.command is command and entry.size <= EXPEDITED]
         title = f"each entry of {command.name} keeps its written value when other entries are written"
         yield _case("records", command.name, title, partial(_keeps_values, command, members), command)
 
@@ -238,8 +238,8 @@ def _refused(entry: Entry, data: bytes, probe: CanopenProbe) -> None:
 # --- PDOs ---
 
 
-def _pdos(layout: Any, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
-    by_name = {entry.name.lower(): entry for entry in found}
+def _pdos(layout: Any, entries: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+    by_name = {entry.name.lower(): entry for entry in entries}
     for first, models in ((0x1400, layout.rpdo), (0x1800, layout.tpdo)):
         kind = "tpdos" if first == 0x1800 else "rpdos"
         for number, model in enumerate(models):
@@ -263,7 +263,7 @@ def _pdos(layout: Any, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
                 title = f"{label} is sent when frames are taken"
                 yield _case(kind, f"{number + 1}.frames", title, partial(_sent_with_frames, index, model))
             if first == 0x1400 and model.enabled:
-                yield from _clock(index, model, mapped, found)
+                yield from _clock(index, model, mapped, entries)
 
 
 def _default(index: int, model: Any, mapped: list[Entry], probe: CanopenProbe) -> None:

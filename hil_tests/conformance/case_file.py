@@ -102,18 +102,18 @@ def text_cases(
     Raises BenchError: the file cannot be read, or has errors; one line for each.
     """
     file = _read(path)
-    known = ChainMap(file.texts, dict(names))
+    replacements = ChainMap(file.texts, dict(names))
     optional = _names_of_links() if link in BUSES else frozenset()
     cases, wrong = [], []
     for area in file.area:
         for item in area.cases if link in area.links else ():
             try:
                 texts = item.id, item.title, item.clause or area.clause, item.lines
-                name, title, clause, lines = (text.format_map(known) for text in texts)
+                name, title, clause, lines = (text.format_map(replacements) for text in texts)
             except KeyError as missing:
                 name = missing.args[0]
                 if name not in optional:
-                    close = did_you_mean(name, {*known, *optional})
+                    close = did_you_mean(name, {*replacements, *optional})
                     wrong.append(f"{path}: {area.name}.{item.id}: unknown name {name!r} in braces{close}")
                 continue
             except ValueError as error:

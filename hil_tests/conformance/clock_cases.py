@@ -125,12 +125,12 @@ def clock_cases(unit: Unit) -> Iterator[Case[LinkProbe]]:
             continue
         times = [item for item in times_of(row) if not item.of_frame]
         counts = [item for item in counts_of(row, SENT) if unit.readable and not row.only_sent]
-        asked = [item for item in counts if SENT[item.quantity][0]]
-        if times or asked:
+        counted_requests = [item for item in counts if SENT[item.quantity][0]]
+        if times or counted_requests:
             title = (
                 f"times and counts of requests in {row.name} advance as the tester's clock and requests do"
             )
-            run = partial(_clocks, row, times, asked)
+            run = partial(_clocks, row, times, counted_requests)
             yield case_in("clocks", row.name, title, run, row)
         commanded = [item for item in counts if SENT[item.quantity][1]]
         if commanded and command is not None:
@@ -181,11 +181,11 @@ def _counted(item: Field, passage: Passage) -> float | None:
 
 def _check_sent(row: Row, counts: list[Field], passage: Passage, telemetry: int, telecommands: int) -> None:
     for item in counts:
-        seen = _counted(item, passage)
+        count = _counted(item, passage)
         per_read, per_command = SENT[item.quantity]
         wanted = (telemetry * per_read + telecommands * per_command) * 1.0
         at = f"{row.name}.{item.name} ({item.quantity}) {wanted:g} more"
-        check(seen in (None, wanted), at, f"{passage.before[item.name]!s} and {passage.after[item.name]!s}")
+        check(count in (None, wanted), at, f"{passage.before[item.name]!s} and {passage.after[item.name]!s}")
 
 
 def check_times(row: Row, times: list[Time], passage: Passage, epoch: str) -> None:
@@ -197,7 +197,7 @@ def check_times(row: Row, times: list[Time], passage: Passage, epoch: str) -> No
         check(low <= passed <= high, wanted, f"{passed:.9g} s")
 
 
-def _clocks(row: Row, times: list[Time], asked: list[Field], probe: LinkProbe) -> None:
+def _clocks(row: Row, times: list[Time], counts: list[Field], probe: LinkProbe) -> None:
     def wait() -> None:
         for _ in range(ASKED if probe.unit.readable else 0):
             probe.expect_alive()
@@ -205,7 +205,7 @@ def _clocks(row: Row, times: list[Time], asked: list[Field], probe: LinkProbe) -
 
     passage = passage_of(probe, row, wait)
     check_times(row, times, passage, probe.unit.conventions.epoch)
-    _check_sent(row, asked, passage, ASKED + 1, 0)
+    _check_sent(row, counts, passage, ASKED + 1, 0)
 
 
 def _commands(row: Row, counts: list[Field], command: Row, probe: LinkProbe) -> None:
@@ -232,11 +232,11 @@ def _measurements(row: Row, times: list[Time], counts: list[Field], probe: LinkP
         wanted = f"{row.name}.{time} at most {high:.3f} s later, by the tester's clock"
         check(max(low, time.resolution_s / 4) <= passed <= high, wanted, f"{passed:.9g} s")
     for item in counts:
-        seen = _counted(item, passage)
-        if not seen:
+        count = _counted(item, passage)
+        if not count:
             still.append(item.name)
             continue
         most = passage.most_s * FRAME_RATE_HZ + 1.0
-        check(0.0 < seen <= most, f"{row.name}.{item.name} at most {most:.0f} more", f"{seen:g}")
+        check(0.0 < count <= most, f"{row.name}.{item.name} at most {most:.0f} more", f"{count:g}")
     if still:
         raise CaseSkipped(f"not judged, because nothing was measured meanwhile: {', '.join(still)}")

@@ -357,7 +357,7 @@ class LinkProbe(Probe):
 
     def check_reported(self, row_id: int, error: str, index: int | None = None) -> None:
         """Read the row that reports the last telecommand, if the unit has one: ID, error, and index of a field."""
-        wanted: dict[str, Value | None] = {
+        expectations: dict[str, Value | None] = {
             "request.last": row_id,
             "request.error": error,
             "request.index": index,
@@ -366,13 +366,13 @@ class LinkProbe(Probe):
             named = {item.value: name for name, item in row.named.items() if item.value in REPORTED}
             if "request.error" not in named:
                 continue
-            seen = self.telemetry(row.name)
+            values = self.telemetry(row.name)
             for quantity, name in named.items():
-                expected = wanted[str(quantity)]
-                if quantity == "request.error" and not isinstance(seen[name], str):
+                expected = expectations[str(quantity)]
+                if quantity == "request.error" and not isinstance(values[name], str):
                     expected = self.unit.code(error)
                 if expected is not None:
-                    check_equal(seen[name], expected, REPORTED[str(quantity)])
+                    check_equal(values[name], expected, REPORTED[str(quantity)])
 
     def expect_silence(self, why: str, seconds: float | None = None) -> None:
         """Fail the case if anything but unsolicited telemetry arrives within a time."""
@@ -384,20 +384,20 @@ class LinkProbe(Probe):
         """Fail the case unless the next valid request is answered."""
         self.data_of(self.lively)
 
-    def wait_for(self, name: str, wanted: Mapping[str, Value], within_s: float) -> dict[str, Value]:
+    def wait_for(self, name: str, expected: Mapping[str, Value], within_s: float) -> dict[str, Value]:
         """Read a row until its fields have the wanted values; fail the case if this takes too long."""
         end = self.now() + within_s
         row = self.unit.telemetry[name]
         while True:
             answer = self.ask(row)
-            seen: object = answer
+            last: object = answer
             if answer.kind == "telemetry" and len(answer.data) == row.size:
                 values = row.decode(answer.data)
-                if all(values[key] == value for key, value in wanted.items()):
+                if all(values[key] == value for key, value in expected.items()):
                     return values
-                seen = {key: values[key] for key in wanted}
+                last = {key: values[key] for key in expected}
             if self.now() > end:
-                raise CaseFailed(f"{name} with {dict(wanted)} within {within_s:g} s", str(seen))
+                raise CaseFailed(f"{name} with {dict(expected)} within {within_s:g} s", str(last))
             self.sleep(0.02)
 
     # --- around a case ---
@@ -419,15 +419,15 @@ class LinkProbe(Probe):
 
     def identity(self) -> str:
         """Return what the unit reports of its identity; empty if no row does."""
-        found: dict[str, Value] = {}
+        parts: dict[str, Value] = {}
         for row in self.unit.readable.values():
             names = [name for name, item in row.named.items() if (item.value or "").startswith("identity.")]
-            found |= {
+            parts |= {
                 name: value
                 for name, value in (self.telemetry(row.name) if names else {}).items()
                 if name in names
             }
-        return ", ".join(f"{name} {value!s}" for name, value in found.items())
+        return ", ".join(f"{name} {value!s}" for name, value in parts.items())
 
     def silence(self, *, booting: bool) -> str | None:
         """Read three telemetry rows; return None if one is answered correctly, otherwise the invalid answer, and what to check.
@@ -439,11 +439,11 @@ class LinkProbe(Probe):
         if not rows:
             return None if self.receive_unsolicited(FRAME_S) else "nothing"
         while True:
-            seen = [answer for row in rows if (answer := self._bad_answer(row)) is not None]
-            if len(seen) < len(rows):
+            bad_answers = [answer for row in rows if (answer := self._bad_answer(row)) is not None]
+            if len(bad_answers) < len(rows):
                 return None
             if self.now() >= end:
-                worst = max(seen, key=lambda answer: (bool(answer.fault), answer.kind != "none"))
+                worst = max(bad_answers, key=lambda answer: (bool(answer.fault), answer.kind != "none"))
                 unclear = worst.kind != "none" and not worst.fault
                 return f"{worst}; check --dialect, --baud and the addresses" if unclear else str(worst)
 

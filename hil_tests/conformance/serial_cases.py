@@ -182,13 +182,13 @@ def serial_names(unit: Unit) -> dict[str, str]:
     """
     small = sorted(unit.readable.values(), key=lambda row: row.size)[:2]
     lively = lively_row(unit, SerialLine(unit).envelope.can_refuse)
-    found: dict[str, str] = {}
+    names: dict[str, str] = {}
     for name, row in (("row", small[0]), ("other", small[-1]), ("lively", lively)):
-        found |= {name: f"{row.id:02X}", f"{name}_id": str(row.id)}
-    found["read"] = f"1F 7F {found['row']} 1F FF"
+        names |= {name: f"{row.id:02X}", f"{name}_id": str(row.id)}
+    names["read"] = f"1F 7F {names['row']} 1F FF"
     if all(row.id != ESCAPE for row in unit.rows):
-        found["no_row_31"] = str(ESCAPE)
-    return found
+        names["no_row_31"] = str(ESCAPE)
+    return names
 
 
 # --- texts ---

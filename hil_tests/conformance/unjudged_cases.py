@@ -33,11 +33,11 @@ def unjudged_cases(unit: Unit, fields: Iterable[tuple[Row, Field]]) -> Iterator[
 
 def unjudged_fields(unit: Unit, compared: Iterable[tuple[Row, str]]) -> Iterator[tuple[Row, Field]]:
     """Yield the fields that no case of a serial line or CAN judges; `compared` are judged by cases of several rows."""
-    known = {(row.name, name) for row, name in compared}
+    fields = {(row.name, name) for row, name in compared}
     for row in unit.telemetry.values():
         judged = {item.name for item in _judged(unit, row)}
         for name, item in row.named.items():
-            if name not in judged and (row.name, name) not in known:
+            if name not in judged and (row.name, name) not in fields:
                 yield row, item
 
 

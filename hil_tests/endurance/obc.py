@@ -132,19 +132,19 @@ class Obc:
         """Send a request, data in hexadecimal, and judge the answers."""
         message_class, row_id, kind = row
         request = Request(row_id, bytes.fromhex(data), message_class, telemetry=kind == "telemetry")
-        known = self._definition.by_key.get((message_class, row_id))
-        if known is not None and known.kind != kind:
-            known = None
-        if link == "canopen" and not self._in_dictionary(known, request):
+        defined_row = self._definition.by_key.get((message_class, row_id))
+        if defined_row is not None and defined_row.kind != kind:
+            defined_row = None
+        if link == "canopen" and not self._in_dictionary(defined_row, request):
             return
-        verdict = self._oracle.verdict(known, request)
+        verdict = self._oracle.verdict(defined_row, request)
         try:
             self._ports[link].ask(request)
         except (ValueError, OverflowError):
             return  # the header has no room for such an ID
         self._outcome.requests += 1
         counts = link != "canopen" or not (
-            request.telemetry or known is None or self._oracle.is_outside(known, request.data)
+            request.telemetry or defined_row is None or self._oracle.is_outside(defined_row, request.data)
         )
         if counts and not self._oracle.stuck:
             self._oracle.counted(request)
@@ -156,7 +156,7 @@ class Obc:
         elif link in self._oracle.disturbed:
             await self._unknown_outcome(link, request)
         else:
-            await self._judge(link, known, request, verdict, answers, counts=counts)
+            await self._judge(link, defined_row, request, verdict, answers, counts=counts)
 
     def _in_dictionary(self, row: Row | None, request: Request) -> bool:
         """Return whether a request can be made by SDO."""
@@ -175,13 +175,13 @@ class Obc:
 
     def _answers(self, link: str) -> list[Answer]:
         """Return the answers on a link; packets of files that follow them are judged apart."""
-        found: list[Answer] = []
+        answers: list[Answer] = []
         for _, event in self._ports[link].answers():
             if event.kind not in ("unsolicited", "burst"):
-                found.append(event)
+                answers.append(event)
             elif link not in self._oracle.disturbed:
                 self._judge_unasked(link, event)
-        return found
+        return answers
 
     async def _judge(
         self,
@@ -287,13 +287,15 @@ class Obc:
         if link == "canopen" or self._oracle.stuck or link in self._oracle.disturbed:
             return
         known = [self._definition.by_key[message_class, row_id] for message_class, row_id, _ in rows]
-        asked = [row for row in known if self._oracle.verdict(row, self._definition.request(row)) == "ok"]
-        self._outcome.requests += len(asked)
-        self._ports[link].ask(*(self._definition.request(row) for row in asked))
+        answerable = [
+            row for row in known if self._oracle.verdict(row, self._definition.request(row)) == "ok"
+        ]
+        self._outcome.requests += len(answerable)
+        self._ports[link].ask(*(self._definition.request(row) for row in answerable))
         replies = self._answers(link)
-        if len(replies) != len(asked) or any(reply.kind != "telemetry" for reply in replies):
-            raise Violation(f"{link}: {len(replies)} answers to {len(asked)} requests")
-        for row, reply in zip(asked, replies, strict=True):
+        if len(replies) != len(answerable) or any(reply.kind != "telemetry" for reply in replies):
+            raise Violation(f"{link}: {len(replies)} answers to {len(answerable)} requests")
+        for row, reply in zip(answerable, replies, strict=True):
             self._oracle.counted(self._definition.request(row))
             if reply.row_id not in (None, row.id) or len(reply.data) != row.size:
                 raise Violation(f"{link}: {reply} where {row.name} was next")

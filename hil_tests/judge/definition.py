@@ -144,13 +144,13 @@ class Unit:
 
         The row includes the fields of the telecommand, or has the same parameters in the same layout.
         """
-        found = {}
+        reports = {}
         for row in self.readable.values():
             for name in {
                 item.telecommand: None for item in row.named.values() if item.telecommand is not None
             }:
                 command = self.telecommands[name]
-                found[name, row.name] = command, row, {field: field for field in command.named}
+                reports[name, row.name] = command, row, {field: field for field in command.named}
         for command in self.telecommands.values():
             fields = {
                 item.of_parameter: item.name for item in command.named.values() if item.parameter is not None
@@ -162,8 +162,8 @@ class Unit:
                     if item.of_parameter in fields
                 }
                 if len(places) == len(fields):
-                    found[command.name, row.name] = command, row, places
-        return tuple(found.values())
+                    reports[command.name, row.name] = command, row, places
+        return tuple(reports.values())
 
     def request(self, row: Row | int, data: bytes = b"", message_class: str = "") -> Request:
         """Return the request for a row, or for an ID, which need not belong to one."""

@@ -332,12 +332,12 @@ class Row:
 
     def encode(self, values: Mapping[str, Value] | None = None) -> bytes:
         """Return the bytes of a row; a missing value becomes the plain one. Limits are not looked at."""
-        given = {**self.example(), **(values or {})}
-        if given.keys() != self.named.keys():
-            raise LookupError(f"{self.name} has no field {', '.join(given.keys() - self.named.keys())}")
+        by_name = {**self.example(), **(values or {})}
+        if by_name.keys() != self.named.keys():
+            raise LookupError(f"{self.name} has no field {', '.join(by_name.keys() - self.named.keys())}")
         data = bytearray(self.size)
         for name, item in self.named.items():
-            item.write(data, item.raw_of(given[name]))
+            item.write(data, item.raw_of(by_name[name]))
         return bytes(data)
 
     def decode(self, data: bytes) -> dict[str, Value]:

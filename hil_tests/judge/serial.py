@@ -99,9 +99,9 @@ class SerialLine:
         return _of_class(self._requests_in, message_class)[1:]
 
     def clear(self) -> None:
-        """Forget everything received and asked."""
+        """Forget everything received and pending."""
         self.received = bytearray()
-        self._asked: deque[Request] = deque()
+        self._pending: deque[Request] = deque()
         self._begin()
 
     def numbered(self, request: Request) -> Request:
@@ -132,8 +132,8 @@ class SerialLine:
 
     def expect(self, request: Request) -> None:
         """Note a request, in order."""
-        self._asked.append(request)
-        if len(self._asked) == 1:
+        self._pending.append(request)
+        if len(self._pending) == 1:
             self._begin()
 
     def feed(self, data: bytes) -> list[Answer]:
@@ -141,15 +141,15 @@ class SerialLine:
         self.received += data
         answers = []
         while self.received:
-            asked = self._asked[0] if self._asked else None
+            pending = self._pending[0] if self._pending else None
             _, framing, envelope = self._answer_format(self.received[:1])
             echo = (
                 None
-                if asked is None or self._echoed or not self._answers(asked, "echo")
-                else envelope.body(asked)
+                if pending is None or self._echoed or not self._answers(pending, "echo")
+                else envelope.body(pending)
             )
             measure = (
-                partial(envelope.size, asked=asked) if echo is None else partial(_size_of_echo, len(echo))
+                partial(envelope.size, pending=pending) if echo is None else partial(_size_of_echo, len(echo))
             )
             try:
                 taken = framing.take(self.received, measure)
@@ -158,7 +158,7 @@ class SerialLine:
                 self.received.clear()
             if taken is None:
                 break
-            answer = self._answer(envelope, taken, asked, echo)
+            answer = self._answer(envelope, taken, pending, echo)
             if answer is not None:
                 answers.append(answer)
         return answers
@@ -172,19 +172,21 @@ class SerialLine:
         return self._answers_in[-1]
 
     def _answer(
-        self, envelope: Envelope, taken: Taken, asked: Request | None, echo: bytes | None
+        self, envelope: Envelope, taken: Taken, pending: Request | None, echo: bytes | None
     ) -> Answer | None:
         if taken.junk or (echo is not None and taken.body != echo):
             answer = Answer("malformed", data=taken.body)
-        elif asked is not None and echo is not None:
+        elif pending is not None and echo is not None:
             if self._left:
                 self._echoed = True
                 return None
-            answer = Answer("ack", row_id=asked.id, message_class=asked.message_class)
+            answer = Answer("ack", row_id=pending.id, message_class=pending.message_class)
         else:
-            answer = envelope.answer(taken, asked)
-        awaited = asked is not None and (
-            answer.row_id in (None, asked.id) or self._follows(asked, answer) or answer.kind == "malformed"
+            answer = envelope.answer(taken, pending)
+        awaited = pending is not None and (
+            answer.row_id in (None, pending.id)
+            or self._follows(pending, answer)
+            or answer.kind == "malformed"
         )
         streamed = (answer.message_class, answer.row_id) in self.streamed
         if (
@@ -197,21 +199,21 @@ class SerialLine:
         if awaited and answer.final and answer.kind not in ("unsolicited", "burst"):
             self._left -= 1
             if self._left <= 0 or answer.kind in ("nack", "malformed") or self.envelope.has_final:
-                self._asked.popleft()
+                self._pending.popleft()
                 self._begin()
         return answer
 
     def _begin(self) -> None:
         """Begin to await the answers of the oldest request."""
         self._echoed = False
-        row = self._unit.row(self._asked[0]) if self._asked else None
+        row = self._unit.row(self._pending[0]) if self._pending else None
         answers = () if row is None else self._unit.serial_answers(row)
         self._left = sum(answer != "echo" for answer in answers)
 
-    def _follows(self, asked: Request, answer: Answer) -> bool:
+    def _follows(self, pending: Request, answer: Answer) -> bool:
         """Return whether an answer is another row that answers a request."""
         row, other = (
-            self._unit.row(asked),
+            self._unit.row(pending),
             self._unit.row(Request(answer.row_id or 0, message_class=answer.message_class)),
         )
         return row is not None and other is not None and f"row:{other.name}" in row.answers
@@ -349,42 +351,42 @@ class Headed:
         covered = b"".join(part for name, part in parts.items() if name in self.covers)
         return header + data + self._compute(covered)
 
-    def size(self, begun: bytes, asked: Request | None) -> int | None:
+    def size(self, begun: bytes, pending: Request | None) -> int | None:
         """Return the size of header, data and check."""
         opened = self.replies.read(begun, self._message_class)
         if opened is None:
             return None
         data = self.replies.data_size(opened)
         if data is None:
-            row = self._unit.row(self._request(opened, asked))
+            row = self._unit.row(self._request(opened, pending))
             data = row.size if row is not None and row.is_telemetry and not _refused(opened) else 0
         return opened.size + data + self.check_size
 
-    def _request(self, opened: Opened, asked: Request | None) -> Request:
+    def _request(self, opened: Opened, pending: Request | None) -> Request:
         """Return the request that an answer names, or the one that was asked if it names none."""
         if "id" not in opened.values:
-            if asked is None or asked.message_class in self._elsewhere:
+            if pending is None or pending.message_class in self._elsewhere:
                 raise ValueError("an answer without a request")
-            if self._classes and asked.message_class not in self._classes:
+            if self._classes and pending.message_class not in self._classes:
                 raise ValueError("an answer in the format of another class")
-            return asked
+            return pending
         message_class = opened.message_class or (
-            asked.message_class if asked is not None and asked.id == opened.values["id"] else ""
+            pending.message_class if pending is not None and pending.id == opened.values["id"] else ""
         )
         return Request(opened.values["id"], message_class=message_class)
 
-    def answer(self, taken: Taken, asked: Request | None) -> Answer:
+    def answer(self, taken: Taken, pending: Request | None) -> Answer:
         """Return the answer in header, data and check, all of which must be right."""
         end = len(taken.body) - self.check_size
         text = taken.body[: max(end, 0)]
         if not self._classes and self.closed(b"", text) == taken.body:
-            found = self._text_answer(text, asked, taken.body)
+            found = self._text_answer(text, pending, taken.body)
             if found is not None:
                 return found
         malformed = partial(Answer, "malformed", data=taken.body)
         try:
             opened = self.replies.read(text, self._message_class)
-            request = None if opened is None else self._request(opened, asked)
+            request = None if opened is None else self._request(opened, pending)
         except ValueError as error:
             return malformed(fault=str(error))
         if opened is None or request is None:
@@ -400,11 +402,11 @@ class Headed:
         values = opened.values
         asynchronous = values.get("class") in self._unsolicited
         numbered = ("unsolicited" if asynchronous else "reply") in self._numbered
-        named = asked is not None and opened.values.get("id", asked.id) == asked.id
-        if asked is not None and named and not asynchronous and not numbered:
-            sequence = values.get("sequence", asked.sequence)
-            if sequence != asked.sequence:
-                return malformed(fault=f"sequence {sequence}, must be {asked.sequence}")
+        named = pending is not None and opened.values.get("id", pending.id) == pending.id
+        if pending is not None and named and not asynchronous and not numbered:
+            sequence = values.get("sequence", pending.sequence)
+            if sequence != pending.sequence:
+                return malformed(fault=f"sequence {sequence}, must be {pending.sequence}")
         row = self._unit.row(request)
         message_class = request.message_class or (row.message_class if row is not None else "")
         telemetry = (
@@ -423,12 +425,12 @@ class Headed:
         number = values["sequence"] if numbered else None
         return Answer(kind, code, data, request.id, message_class, 0, final, time_s, taken.body, number)
 
-    def _text_answer(self, text: bytes, asked: Request | None, body: bytes) -> Answer | None:
+    def _text_answer(self, text: bytes, pending: Request | None, body: bytes) -> Answer | None:
         """Return an acknowledge or refusal that is a text, exactly as in the definition; None if it is neither."""
         link, words = self._unit.serial, text.decode("latin-1")
-        row_id, message_class = (None, "") if asked is None else (asked.id, asked.message_class)
+        row_id, message_class = (None, "") if pending is None else (pending.id, pending.message_class)
         if words == link.acknowledge:
-            kind: AnswerKind = "malformed" if asked is None or asked.telemetry else "ack"
+            kind: AnswerKind = "malformed" if pending is None or pending.telemetry else "ack"
             return Answer(kind, data=text, row_id=row_id, message_class=message_class, body=body)
         if link.refusal is None:
             return None
@@ -437,7 +439,12 @@ class Headed:
         if words != before + number + after or (marked and not (number.isascii() and number.isdigit())):
             return None
         return Answer(
-            "malformed" if asked is None else "nack", int(number or 0), text, row_id, message_class, body=body
+            "malformed" if pending is None else "nack",
+            int(number or 0),
+            text,
+            row_id,
+            message_class,
+            body=body,
         )
 
     def marks_unsolicited(self, message_class: str) -> bool:
@@ -475,7 +482,7 @@ class Dialect:
         """Return any number: the end of a message is marked."""
         return range(1 << 16)
 
-    def size(self, begun: bytes, asked: Request | None) -> int | None:  # noqa: ARG002 -- the framing marks the end
+    def size(self, begun: bytes, pending: Request | None) -> int | None:  # noqa: ARG002 -- the framing marks the end
         """Return None: the end of a message is marked."""
         return None
 
@@ -487,22 +494,22 @@ class Dialect:
         """Return True."""
         return True
 
-    def answer(self, taken: Taken, asked: Request | None) -> Answer:
+    def answer(self, taken: Taken, pending: Request | None) -> Answer:
         """Return the answer in a message of the unit's dialect."""
         body = taken.body
-        row = None if asked is None else self._unit.row(asked)
-        as_asked = self._dialect == "b" and row is not None and row.is_telemetry and row.size == len(body)
+        row = None if pending is None else self._unit.row(pending)
+        as_requested = self._dialect == "b" and row is not None and row.is_telemetry and row.size == len(body)
         if (
             taken.start == CUBESPACE[1]
             and body[:1] == bytes((BURST_ID,))
             and len(body) == 1 + BURST_SIZE
-            and not as_asked
+            and not as_requested
         ):
             return Answer("burst", data=body[1:], row_id=BURST_ID, body=body)
         if self._dialect == "b":
-            if asked is None:
+            if pending is None:
                 return Answer("malformed", data=body)
-            return self._generation_1(asked.id, body, body, named=False)
+            return self._generation_1(pending.id, body, body, named=False)
         if not body:
             return Answer("malformed")
         if self._dialect == "a":

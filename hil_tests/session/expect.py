@@ -165,15 +165,15 @@ class Conditions(Keys):
                 if value == expected and isinstance(value, bool) == isinstance(expected, bool)
                 else show(expected)
             )
-        wanted = float(expected) + self.plus
-        tolerance = RELATIVE_ROUNDING * abs(wanted) if self.within is None else self.within
+        target = float(expected) + self.plus
+        tolerance = RELATIVE_ROUNDING * abs(target) if self.within is None else self.within
         if isinstance(value, int) and self.within is None:
             tolerance = 0.0
         angle = self.angle_deg is not None
-        distance = abs(math.remainder(float(value) - wanted, 360.0)) if angle else abs(float(value) - wanted)
+        distance = abs(math.remainder(float(value) - target, 360.0)) if angle else abs(float(value) - target)
         if distance <= tolerance:
             return None
-        text = show(wanted if self.plus else expected)
+        text = show(target if self.plus else expected)
         return text if self.within is None else f"{text} ± {self.within:g} (off by {distance:.6g})"
 
 
@@ -243,14 +243,14 @@ class AttitudeCheck(StatedAttitude):
         except BenchError as refusal:
             return None, str(refusal)
         error = attitude_error(measured, truth)
-        for word, limit, found in (
+        for word, limit, arcsec in (
             ("cross-boresight", self.within_arcsec, error.cross_boresight_arcsec),
             ("roll", self.roll_within_arcsec, error.roll_arcsec),
             ("total", self.total_within_arcsec, error.total_arcsec),
         ):
-            if limit is not None and not found <= limit:
-                problem = f"{word} error {show_angle(found)}, expected at most {limit:g} arcsec"
-                if found > LARGE_ARCSEC:
+            if limit is not None and not arcsec <= limit:
+                problem = f"{word} error {show_angle(arcsec)}, expected at most {limit:g} arcsec"
+                if arcsec > LARGE_ARCSEC:
                     problem += f"; measured {describe(measured)}, true {describe(truth)}"
                 return error, problem
         return error, None

@@ -132,13 +132,13 @@ def _checked(
     try:
         return model.model_validate(table, context={**(context or {}), "broken": frozenset()}), []
     except ValidationError as error:
-        found = list(problems(error, model))
-    broken = {problem.location[0] for problem in found if problem.location}
+        found_problems = list(problems(error, model))
+    broken = {problem.location[0] for problem in found_problems if problem.location}
     if broken:
         rest = {key: value for key, value in table.items() if key not in broken}
         try:
             model.model_validate(rest, context={**(context or {}), "broken": broken})
         except ValidationError as error:
-            found += [problem for problem in problems(error, model) if not problem.location]
-    texts = (str(problem) if problem.key else problem.text for problem in found)
+            found_problems += [problem for problem in problems(error, model) if not problem.location]
+    texts = (str(problem) if problem.key else problem.text for problem in found_problems)
     return None, list(dict.fromkeys(f"{where}: {text}" for text in texts))

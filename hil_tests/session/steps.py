@@ -497,13 +497,13 @@ class SetParameter(RequestStep):
         value = resolve(self.value, session.variables)
         attempt, ack = self.exchange(client.set_parameter, name, value, checked=self.refused is None)
         if ack is not None and self.refused is None:
-            seen = client.get_parameter(name)
-            wanted = self.parameter.check(value)
-            if seen != wanted and not (
-                isinstance(seen, float) and abs(seen - float(wanted)) <= 1e-6 * abs(seen)
+            read_back = client.get_parameter(name)
+            expected = self.parameter.check(value)
+            if read_back != expected and not (
+                isinstance(read_back, float) and abs(read_back - float(expected)) <= 1e-6 * abs(read_back)
             ):
-                attempt.problem = f"{name} reads back as {show(seen)}, expected {show(wanted)}"
-            attempt.detail = f"{name}={show(seen)}"
+                attempt.problem = f"{name} reads back as {show(read_back)}, expected {show(expected)}"
+            attempt.detail = f"{name}={show(read_back)}"
         return attempt
 
 
@@ -570,18 +570,22 @@ class Send(Step):
 
     def run(self, session: SessionState, link: str) -> Attempt:
         """Send the data and compare what comes back."""
-        wanted = self.answer or []
+        patterns = self.answer or []
         client = session.rig.client(link)
-        listening = send_and_listen(client.core, self.data, self.listen_s, wanted, self.timeout_s)
-        seen = client.run(listening)
-        shown = ", ".join(text for text in seen if text) or "nothing"
+        listening = send_and_listen(client.core, self.data, self.listen_s, patterns, self.timeout_s)
+        received = client.run(listening)
+        shown = ", ".join(text for text in received if text) or "nothing"
         if self.answer is None:
             return Attempt(detail=f"came back: {shown}")
         if link == "serial":
-            wanted = ["".join(wanted)]
-        if len(seen) == len(wanted) and all(matches(a, b) for a, b in zip(wanted, seen, strict=True)):
+            patterns = ["".join(patterns)]
+        if len(received) == len(patterns) and all(
+            matches(a, b) for a, b in zip(patterns, received, strict=True)
+        ):
             return Attempt(detail=f"came back: {shown}, as expected")
-        return Attempt(problem=f"came back: {shown}, expected {', '.join(filter(None, wanted)) or 'nothing'}")
+        return Attempt(
+            problem=f"came back: {shown}, expected {', '.join(filter(None, patterns)) or 'nothing'}"
+        )
 
 
 class Wait(Step):
@@ -658,12 +662,12 @@ def _unknown_fields(key: str, row: Row, names: Iterable[str]) -> Iterator[str]:
             yield f"{key}: row '{row.name}' has no field '{name}'{remedy(name, known)}"
 
 
-def _impossible(item: RowField, wanted: Conditions) -> Iterator[str]:
+def _impossible(item: RowField, conditions: Conditions) -> Iterator[str]:
     """Yield why conditions can never hold, and convert their values in place to those of the field."""
     if item.kind == "bytes":
         numeric = {"min", "max", "above", "within", "plus", "angle_deg"}
-        given = {Conditions.model_fields[name].alias or name for name in wanted.model_fields_set}
-        for key in sorted(numeric & given):
+        keys = {Conditions.model_fields[name].alias or name for name in conditions.model_fields_set}
+        for key in sorted(numeric & keys):
             yield f"'{item.name}' is bytes, and '{key}' is for numbers; give value, one_of or not"
     problems: list[str] = []
 
@@ -675,9 +679,9 @@ def _impossible(item: RowField, wanted: Conditions) -> Iterator[str]:
             return value
 
     for key in ("value", "angle_deg", "differs_from"):
-        if (value := getattr(wanted, key)) is not None:
-            setattr(wanted, key, convert(value))
-    wanted.one_of = [convert(value) for value in wanted.one_of]
+        if (value := getattr(conditions, key)) is not None:
+            setattr(conditions, key, convert(value))
+    conditions.one_of = [convert(value) for value in conditions.one_of]
     yield from problems
 
 

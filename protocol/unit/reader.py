@@ -36,7 +36,7 @@ from starhil.protocol.unit.layout import NUMBER, Layout, enum_of
 
 _Item = TypeVar("_Item")
 
-SETS: Final = "set_"
+SETTER_PREFIX: Final = "set_"
 """Prefix of the names of telecommands that can be read back."""
 HIGHEST_ID: Final = 0xFF
 """Highest ID if the link does not limit it."""
@@ -171,7 +171,7 @@ class _Reader:
         table = document[place[0]][place[1]] if len(place) > 1 else None
         name = table.get("name") if isinstance(table, dict) else None
         if isinstance(name, str):
-            self._broken |= {name, name.removeprefix(SETS)}
+            self._broken |= {name, name.removeprefix(SETTER_PREFIX)}
         if place[0] == CLASS or place == (UNIT,):
             self._broken.add(str(place[0]))
         if len(place) == 2 and place[0] in tuple(RequestKind):
@@ -330,8 +330,8 @@ class _Reader:
         plugin = self._icd.plugin
         if model.min_size is not None and model.action not in plugin.actions and plugin.skipped is None:
             raise IcdError("`min_size` needs a telecommand with an action of the unit's plugin")
-        if model.readback is not None and not model.name.startswith(SETS):
-            raise IcdError(f"the name of a telecommand with a readback must begin with {SETS}")
+        if model.readback is not None and not model.name.startswith(SETTER_PREFIX):
+            raise IcdError(f"the name of a telecommand with a readback must begin with {SETTER_PREFIX}")
 
     def _expand_row(self, kind: RequestKind, file: Path, model: schema.RowModel) -> None:
         where = f"{file}: {kind} {model.name}"
@@ -549,7 +549,7 @@ def _readback(model: schema.RowModel) -> schema.RowModel:
     """Return the telemetry row that reports the last accepted values of a telecommand."""
     changes = {
         "id": model.readback,
-        "name": model.name.removeprefix(SETS),
+        "name": model.name.removeprefix(SETTER_PREFIX),
         "doc": "As set.",
         "include": [model.name],
     }
