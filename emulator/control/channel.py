@@ -163,21 +163,21 @@ class ControlServer:
 
     async def execute(self, request: dict[str, Any]) -> Answer:
         """Execute a decoded request, without `id` and `token`, and return its answer."""
-        wanted = str(request.pop("do", ""))
-        if wanted not in self._actions:
-            near = did_you_mean(wanted, self._actions)
+        action_name = str(request.pop("do", ""))
+        if action_name not in self._actions:
+            near = did_you_mean(action_name, self._actions)
             return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}{near}"}
-        action, known = self._actions[wanted]
+        action, keys = self._actions[action_name]
         try:
             head = self._head(request)
-            if known is not None:
-                _check_keys(request, known)
+            if keys is not None:
+                _check_keys(request, keys)
             self._run.wiring.latch()
             return {"ok": True, **await action(head, request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {"ok": False, "error": str(error)}
         except Exception as error:  # an internal error ends neither the run nor the connection
-            log.exception("control channel: %s", wanted)
+            log.exception("control channel: %s", action_name)
             name = type(error).__name__
             return {"ok": False, "error": f"internal error: {name}; see the emulator's log"}
 

@@ -226,14 +226,14 @@ def path_of_head(path: Path, number: int) -> Path:
 def with_own_seeds(profiles: Sequence[Profile]) -> list[Profile]:
     """Return the profiles with distinct seeds: a seed that an earlier head has is increased until unused."""
     seeds: set[int] = set()
-    found: list[Profile] = []
+    seeded: list[Profile] = []
     for profile in profiles:
         seed = profile.run.seed
         while seed in seeds:
             seed += 1
         seeds.add(seed)
-        found.append(profile.model_copy(update={"run": profile.run.model_copy(update={"seed": seed})}))
-    return found
+        seeded.append(profile.model_copy(update={"run": profile.run.model_copy(update={"seed": seed})}))
+    return seeded
 
 
 def check_heads(profiles: Sequence[Profile]) -> None:

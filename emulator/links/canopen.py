@@ -74,9 +74,9 @@ def not_before(deadline: float) -> int:
 class DeviceSample:
     """The device at one moment, `starhil.protocol.canopen.application.Sample`."""
 
-    def __init__(self, requests: Requests, shot: Snapshot) -> None:
+    def __init__(self, requests: Requests, snapshot: Snapshot) -> None:
         self._requests = requests
-        self._shot = shot
+        self._shot = snapshot
 
     def telemetry(self, row: Row) -> bytes:
         """Return the bytes of a telemetry row."""

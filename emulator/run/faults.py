@@ -243,12 +243,12 @@ class Faults:
 
     def describe(self) -> dict[str, Any]:
         """Return the current faults by level."""
-        found: dict[str, Any] = {}
+        active: dict[str, Any] = {}
         if self._device.surroundings.faults:
-            found["optical"] = self._device.surroundings.faults
+            active["optical"] = self._device.surroundings.faults
         if of_device := {k: v for effect in EFFECTS.values() for k, v in effect.active(self._device).items()}:
-            found["device"] = of_device
+            active["device"] = of_device
         for name, wire in self._wires:
             if not wire.settings.none:
-                found[name] = wire.settings.model_dump()
-        return found
+                active[name] = wire.settings.model_dump()
+        return active
