@@ -276,22 +276,24 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
     StaridError
         The image has an unsupported type or shape.
     """
-    chosen = DetectionSettings() if settings is None else settings
+    options = DetectionSettings() if settings is None else settings
     counts = _checked_image(image)
-    saturation = chosen.saturation_dn if chosen.saturation_dn is not None else int(np.iinfo(counts.dtype).max)
-    background = estimate_background(counts, chosen.block_px)
+    saturation = (
+        options.saturation_dn if options.saturation_dn is not None else int(np.iinfo(counts.dtype).max)
+    )
+    background = estimate_background(counts, options.block_px)
     if background.median_level >= saturation:
         found = _no_detections(background, "image is saturated all over: shorten the exposure")
         return dataclasses.replace(found, searchable=False)
-    sigma = chosen.psf_sigma_px if chosen.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
-    scene = _Scene(counts, background, chosen, float(saturation))
+    sigma = options.psf_sigma_px if options.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
+    scene = _Scene(counts, background, options, float(saturation))
     peaks, heights = _peaks(scene, sigma)
     shape = _estimate_shape(scene, peaks)
-    if chosen.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
+    if options.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
         peaks, heights = _peaks(scene, shape.sigma_px)
         shape = _estimate_shape(scene, peaks, shape.sigma_px)
     peaks, heights, hot = _without_hot_pixels(scene, peaks, heights, shape.sigma_px)
-    unsure = chosen.follow_trails and shape.trail_px == 0.0
+    unsure = options.follow_trails and shape.trail_px == 0.0
     if unsure and len(hot) > len(peaks):
         shape = _trails_among_round(scene, peaks, shape)
         unsure = False
@@ -411,13 +413,13 @@ def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float = _ASSUMED_S
     start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
     tries = peaks[: 4 * _STARS_FOR_SHAPE]
     # a few stars show whether there are trails at all; more are needed only to follow them
-    for wanted in (_STARS_FOR_A_GLANCE, _STARS_FOR_SHAPE):
-        table = np.empty((wanted, MOMENT_COLUMNS))
+    for star_count in (_STARS_FOR_A_GLANCE, _STARS_FOR_SHAPE):
+        table = np.empty((star_count, MOMENT_COLUMNS))
         count = moments_of(
             scene.counts, tries, *scene.level, start, _SHAPE_WINDOW_PX, scene.saturation, table
         )
         shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
-        if shape.trail_px == 0.0 or count < wanted:
+        if shape.trail_px == 0.0 or count < star_count:
             break
     if settings.psf_sigma_px is None and shape.trail_px == 0.0:
         widths = np.empty(_STARS_FOR_WIDTH)
@@ -480,15 +482,15 @@ def _with_companions(fits: _Fits, blend_px: float) -> _Fits:
     suspects = np.flatnonzero(bad & ((fits.flags & SATURATED) == 0))
     partners, owners = np.empty(len(suspects), FIT), np.empty(len(suspects), dtype=np.int64)
     near = (fits.first, fits.neighbours)
-    found = split_pairs(
+    pair_count = split_pairs(
         fits.windows, fits.pixels, *near, fits.sensor[:3], stars, suspects, blend_px, partners, owners, bad
     )
     fits.measure(bad, AGAIN)
-    owners = owners[:found]
+    owners = owners[:pair_count]
     return dataclasses.replace(
         fits,
         windows=np.concatenate([fits.windows, fits.windows[owners]]),
-        stars=np.concatenate([stars, partners[:found]]),
+        stars=np.concatenate([stars, partners[:pair_count]]),
         flags=np.concatenate([fits.flags, fits.flags[owners]]),
     )
 
