@@ -21,7 +21,7 @@ _NAMES: Final = (
 COMMANDS: Final = {name: f"starhil.emulator.cli.{name}" for name in _NAMES.split()}
 """Sub-command → module."""
 
-MOVED: Final[dict[tuple[str, ...], str]] = {
+MOVED_COMMANDS: Final[dict[tuple[str, ...], str]] = {
     **{(name,): name for name in ("identify", "calibrate", "catalog", "features", "database", "reproduce")},
     ("bench", "identify"): "bench",
 }
@@ -37,7 +37,7 @@ def build_app(words: Sequence[str] = ()) -> typer.Typer:
 def main() -> None:
     """Run the command line; a sub-command that has moved to `starid` is run there."""
     words = sys.argv[1:]
-    for old, new in MOVED.items():
+    for old, new in MOVED_COMMANDS.items():
         if tuple(words[: len(old)]) == old:
             from starid.cli import app
 

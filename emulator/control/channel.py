@@ -51,17 +51,21 @@ log = logging.getLogger("starhil.control")
 MAX_LINE: Final = 1 << 16
 """Longest request, bytes."""
 
-EXAMINED: Final = 200
+EXAMINED_ERRORS: Final = 200
 """Number of errors of a request that are examined; of further ones the answer gives the number."""
 
 KEPT_FRAMES: Final = 200
-BUSY: Final = b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
+BUSY_ANSWER: Final = (
+    b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
+)
 
 REQUEST_S: Final = 10.0
 """Time within which a peer of the control channel or of the console must complete a request: a line, after its first
 byte; for HTTP, after it has connected or received the last response, and the body after the headers; seconds."""
 
-LATE: Final = json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
+LATE_ANSWER: Final = (
+    json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
+)
 
 Answer = dict[str, Any]
 Action = Callable[[Head, dict[str, Any]], Awaitable[Answer]]
@@ -81,7 +85,7 @@ class ControlServer:
         self._quit = quit_run
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
-        self._limit = ConnectionLimit("control channel", BUSY)
+        self._limit = ConnectionLimit("control channel", BUSY_ANSWER)
         self._actions: dict[str, tuple[Action, tuple[str, ...] | None]] = {
             "status": (self._status, ()),
             "truth": (self._truth, ("run_time_s", "unix_s")),
@@ -138,7 +142,7 @@ class ControlServer:
         except ConnectionError as error:
             log.info("control channel: connection lost (%s)", error)
         except TimeoutError:
-            writer.write(LATE)
+            writer.write(LATE_ANSWER)
         finally:
             self._writers.discard(writer)
             writer.close()
@@ -303,7 +307,7 @@ async def _parse(model: type[Model], value: object) -> Model:
         try:
             return model.model_validate_json(json.dumps(value))
         except ValidationError as error:
-            raise EmulatorError(*map(str, problems(error, model, value, most=EXAMINED))) from None
+            raise EmulatorError(*map(str, problems(error, model, value, most=EXAMINED_ERRORS))) from None
 
     return await asyncio.to_thread(parse)
 

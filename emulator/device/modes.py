@@ -38,7 +38,7 @@ class Mode(StrEnum):
 
 
 _RUNNING: Final = frozenset(Mode) - {Mode.BOOT, Mode.ERROR}
-COMMANDED: Final[dict[Mode, frozenset[Mode]]] = {
+COMMANDABLE_MODES: Final[dict[Mode, frozenset[Mode]]] = {
     **dict.fromkeys(_RUNNING, _RUNNING),
     Mode.BOOT: frozenset(),
     Mode.ERROR: frozenset({Mode.STANDBY}),
@@ -78,7 +78,7 @@ class Modes:
 
     def command(self, mode: Mode, *, has_attitude: bool) -> bool:
         """Change the mode by telecommand; return False if this is not allowed. Tracking needs an attitude to start from."""
-        if mode not in COMMANDED[self.mode] or (mode is Mode.TRACKING and not has_attitude):
+        if mode not in COMMANDABLE_MODES[self.mode] or (mode is Mode.TRACKING and not has_attitude):
             return False
         self._enter(mode, Cause.COMMAND)
         return True

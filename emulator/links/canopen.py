@@ -24,7 +24,7 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
 from starhil.protocol.canopen.cob import SDO_RECEIVE
-from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
+from starhil.protocol.canopen.context import UNCONFIGURED_NODE, EventKind, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
@@ -223,7 +223,7 @@ class CanopenLink(Link[CanFrame]):
     async def start(self) -> str:
         """Join the bus and send the boot-up message; return the description of the bus."""
         bus, node = await super().start(), self.slave.node_id
-        self._node.acquire(bus, 0 if node == UNCONFIGURED else node)
+        self._node.acquire(bus, 0 if node == UNCONFIGURED_NODE else node)
         self._run_action(self.slave.start)
         return bus
 

@@ -11,7 +11,7 @@ from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, enc
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
 OD: Final = CaseArea[CanopenProbe]("od", "CiA 301 7.2.4.3.17", intrusive=True)
-NOT_NOW = {Abort.NO_DATA, Abort.GENERAL, Abort.DEVICE_STATE, Abort.NOT_STORED}
+NO_VALUE_ABORTS = {Abort.NO_DATA, Abort.GENERAL, Abort.DEVICE_STATE, Abort.NOT_STORED}
 """Aborts which show that an object exists but has no value at present."""
 
 
@@ -23,7 +23,7 @@ def _readable(indices: range, probe: CanopenProbe) -> None:
         result = probe.try_read(item.index, item.subindex)
         where = f"{item.index:04X}h:{item.subindex:02X}h"
         if isinstance(result, int):
-            check(result in NOT_NOW, f"{where} ({item.qualname}) read", f"abort 0x{result:08X}")
+            check(result in NO_VALUE_ABORTS, f"{where} ({item.qualname}) read", f"abort 0x{result:08X}")
         elif size_of(item) is not None:
             check_equal(len(result), size_of(item), f"bytes of {where} ({item.qualname})")
 

@@ -40,7 +40,7 @@ from starhil.hil_tests.judge.rows import Field, Row
 
 BOOT_S: Final = 15.0
 """Maximum time from a reset to the end of booting."""
-CHANGING: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
+CHANGING_QUANTITIES: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
 """Prefixes of the names of quantities that change with each exposure."""
 UNUSED_ID: Final = 0x3E0
 """CAN ID for a PDO that has none."""
@@ -258,7 +258,9 @@ def _pdos(layout: Any, entries: list[Entry]) -> Iterator[Case[CanopenProbe]]:
                 first == 0x1800
                 and model.enabled
                 and not model.event_ms
-                and any(_reports(entry, *CHANGING) and not _fields(entry)[0].width for entry in mapped)
+                and any(
+                    _reports(entry, *CHANGING_QUANTITIES) and not _fields(entry)[0].width for entry in mapped
+                )
             ):
                 title = f"{label} is sent when frames are taken"
                 yield _case(kind, f"{number + 1}.frames", title, partial(_sent_with_frames, index, model))

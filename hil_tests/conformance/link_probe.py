@@ -26,7 +26,7 @@ SEQUENCE: Final = "sequence"
 
 SETTING_ACTIONS: Final = frozenset({None, "nothing", "set_parameters", "subscribe", "select_unsolicited"})
 """Actions of the device model that repeating a telecommand with the same data does not carry out again."""
-UNASKED: Final = frozenset({"unsolicited_rate", "unsolicited_selection"})
+UNSOLICITED_PARAMETERS: Final = frozenset({"unsolicited_rate", "unsolicited_selection"})
 """Parameters that change what a unit sends unasked."""
 LONG_PAUSE_S: Final = 0.8
 """Pause after which the device has abandoned an incomplete message (after 0.5 s)."""
@@ -36,9 +36,9 @@ FRAME_S: Final = 10.0
 """Longest time from one measurement to the next."""
 RECOVERY_S: Final = 1.0
 """Pause after a failed case, in which time-outs of the device pass."""
-SHOWING: Final = 8
+LIVELY_SIZE: Final = 8
 """Bytes of telemetry in which a lost or shifted byte shows."""
-REPORTED: Final = {
+REPORT_QUANTITIES: Final = {
     "request.last": "last telecommand",
     "request.error": "its error",
     "request.index": "index of the refused field",
@@ -93,14 +93,14 @@ class ReadableSettings:
 def changes_link(unit: Unit, command: Row) -> bool:
     """Return whether a telecommand sets how the unit is reached, or what it sends unasked."""
     names = {item.parameter for item in command.named.values() if item.parameter is not None}
-    return any(name in UNASKED or unit.device_parameters[name].of_link for name in names)
+    return any(name in UNSOLICITED_PARAMETERS or unit.device_parameters[name].of_link for name in names)
 
 
 def lively_row(unit: Unit, can_refuse: Callable[[str], bool]) -> Row:
     """Return the smallest row whose errors show: of several bytes, in a class that can be refused, read without effect."""
 
     def unsuitable(row: Row) -> tuple[bool, bool, bool, int]:
-        return row.action is not None, not can_refuse(row.message_class), row.size < SHOWING, row.size
+        return row.action is not None, not can_refuse(row.message_class), row.size < LIVELY_SIZE, row.size
 
     return min(unit.readable.values(), key=unsuitable)
 
@@ -363,7 +363,7 @@ class LinkProbe(Probe):
             "request.index": index,
         }
         for row in self.unit.readable.values():
-            named = {item.value: name for name, item in row.named.items() if item.value in REPORTED}
+            named = {item.value: name for name, item in row.named.items() if item.value in REPORT_QUANTITIES}
             if "request.error" not in named:
                 continue
             values = self.telemetry(row.name)
@@ -372,7 +372,7 @@ class LinkProbe(Probe):
                 if quantity == "request.error" and not isinstance(values[name], str):
                     expected = self.unit.code(error)
                 if expected is not None:
-                    check_equal(values[name], expected, REPORTED[str(quantity)])
+                    check_equal(values[name], expected, REPORT_QUANTITIES[str(quantity)])
 
     def expect_silence(self, why: str, seconds: float | None = None) -> None:
         """Fail the case if anything but unsolicited telemetry arrives within a time."""

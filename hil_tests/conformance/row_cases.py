@@ -32,7 +32,7 @@ from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Value
 from starhil.hil_tests.judge.rows import Field, Row
 
-FLOOD: Final = 200
+FLOOD_REQUESTS: Final = 200
 SUBSCRIBED_S: Final = 3.0
 LEAST_MESSAGES: Final = 6
 """Number of messages from which a rate is computed, at least."""
@@ -498,7 +498,7 @@ def _subscribe(command: Row, fields: list[str], offered: list[Row], probe: LinkP
 
 def _flood(probe: LinkProbe) -> None:
     rows = sorted(probe.unit.readable.values(), key=lambda row: row.size)[:2]
-    for number in range(FLOOD):
+    for number in range(FLOOD_REQUESTS):
         probe.post(rows[number % len(rows)])
-    for number in range(FLOOD):
+    for number in range(FLOOD_REQUESTS):
         probe.expect_telemetry(rows[number % len(rows)], 2.0)

@@ -51,11 +51,11 @@ LONG_WAIT_S: Final = (20_000.0, 300_000.0)
 MOST_EVENTS_LONG: Final = {False: 40_000, True: 4000}
 """Waits of a long life end early after about this many events, by whether the unit sends heartbeats every second."""
 LONG_UPDATE_RATE_HZ: Final = (0.01, 0.02)
-FLOOD: Final = (20_000, 40_000)
+FLOOD_REQUESTS: Final = (20_000, 40_000)
 """Limits of the number of requests in a flood."""
 USUAL_SHARE: Final = 0.9
 """Share of values that are set to their default, so that the unit mostly works."""
-COUNTING: Final = ("counters.", "uptime", "clock.", "boot.count")
+COUNTING_QUANTITIES: Final = ("counters.", "uptime", "clock.", "boot.count")
 """Beginnings of the quantities that count."""
 ACTION_WEIGHTS: Final = {
     "set_parameter": 6.0,
@@ -82,7 +82,7 @@ EDGE_CLOCKS_S: Final = (0, 2**31 - 2, 2**31, 2**32 - 2, 2**32, 1_767_225_600)
 """Clock settings next to the wraps of 2038 and 2106."""
 
 
-UNRECORDED: Final = frozenset({"disk", "end_pipeline"})
+UNRECORDED_STEPS: Final = frozenset({"disk", "end_pipeline"})
 """Steps that a recording does not contain: it would be on the full disk itself, and has no events of the pipeline."""
 
 
@@ -168,7 +168,7 @@ class LifeGenerator:
         self._attitude_rows = [
             row for row in self._telemetry if any(field.value == "attitude.valid" for field in row.fields)
         ]
-        self._count_rows = self._reporting(COUNTING)
+        self._count_rows = self._reporting(COUNTING_QUANTITIES)
         self._effects = {
             (row.message_class, row.id, row.kind): self._reporting(EFFECTS.get(row.action or "", ()))
             for row in self._telecommands
@@ -315,7 +315,7 @@ class LifeGenerator:
             for other in self._count_rows
             for field in other.fields
         )
-        count = self._random.randint(*FLOOD) if narrow else FLOOD[0] // 20
+        count = self._random.randint(*FLOOD_REQUESTS) if narrow else FLOOD_REQUESTS[0] // 20
         data = bytes(row.size) if row.kind == "telecommand" else b""
         return {**self._request(row, data), "do": "flood", "link": link, "count": count}
 

@@ -195,7 +195,7 @@ class Oracle:
 
     def _mode_verdict(self, commanded: str) -> str | None:
         running = set(self._definition.modes) - {"boot", "error"}
-        votes = {commanded in _COMMANDED.get(mode, running) for mode in self.modes}
+        votes = {commanded in _COMMANDABLE_MODES.get(mode, running) for mode in self.modes}
         if votes == {False} or (commanded == "tracking" and not self._has_imaged):
             return "sequence"
         certain = votes == {True} and commanded != "tracking" and "error" not in self.modes
@@ -432,7 +432,7 @@ class Oracle:
             raise Violation(f"{where}: {value}, not {self._last[1]}")
 
 
-_COMMANDED: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
+_COMMANDABLE_MODES: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
 """Modes that can be commanded from a mode; from all others, any but boot and error (docs/rules.md, R13)."""
 _TIMING: Final = frozenset({"update_rate", "exposure", "delay_time"})
 _ORBIT: Final = frozenset({"orbit_semi_major_axis", "orbit_eccentricity"})

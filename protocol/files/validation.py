@@ -13,7 +13,7 @@ from pydantic_core import ErrorDetails
 
 from starhil.protocol.errors import MAX_PROBLEMS, did_you_mean, remedy
 
-_NEEDED: Final = {
+_REQUIREMENTS: Final = {
     "float_type": "a number",
     "finite_number": "a finite number",
     "int_type": "a whole number",
@@ -39,7 +39,7 @@ _LIMITS: Final = {
 _UNIONS: Final = ("union_tag_invalid", "union_tag_not_found")
 """Types of errors in the key that selects the model of a table."""
 
-_ABSENT: Final = {"missing", *_UNIONS}
+_ERRORS_OF_ABSENT_KEYS: Final = {"missing", *_UNIONS}
 """Types of errors in a key that the document may lack."""
 
 
@@ -99,12 +99,12 @@ def problems(
             location = (*location, str(item["ctx"]["discriminator"]).strip("'"))
             say = partial(_choice, item, models)
         if document is not None:
-            location = _in(document, location, absent=item["type"] in _ABSENT)
+            location = _in(document, location, absent=item["type"] in _ERRORS_OF_ABSENT_KEYS)
         reports.setdefault(location, (item, say))  # an alternative of a union may have been reported
         above.update(location[:count] for count in range(len(location)))
     written = 0
     for location, (item, say) in reports.items():
-        if item["type"] in _NEEDED and location in above:
+        if item["type"] in _REQUIREMENTS and location in above:
             continue  # another alternative has the right type, and errors in it
         key = _dotted(document, location)
         for text in say(written < MAX_PROBLEMS):
@@ -147,8 +147,8 @@ def wording(item: ErrorDetails, *, suggest: bool = True) -> str:
         words, limit = ("at least", "min_length") if kind == "too_short" else ("at most", "max_length")
         number = context["actual_length"]
         return f"must have {words} {context[limit]} items" + ("" if number is None else f", not {number}")
-    elif kind in _NEEDED:
-        text = f"must be {_NEEDED[kind]}"
+    elif kind in _REQUIREMENTS:
+        text = f"must be {_REQUIREMENTS[kind]}"
     else:
         message = item["msg"].removeprefix("Value error, ")
         text = f"{message[:1].lower()}{message[1:]}"

@@ -44,7 +44,7 @@ class Names(dict[str, _Item]):
         raise UnknownNameError(f"no {self._what} named {name!r}{hint}")
 
 
-SELECTING: Final = frozenset({"subscribe", "select_unsolicited"})
+SELECTING_ACTIONS: Final = frozenset({"subscribe", "select_unsolicited"})
 """Actions that select rows to be sent unsolicited."""
 SELECTION: Final = "unsolicited_selection"
 """Parameter that selects a row to be sent unsolicited."""
@@ -105,7 +105,7 @@ class InterfaceDefinition:
     @cached_property
     def selects_unsolicited(self) -> bool:
         """Whether a telecommand or a parameter may select any telemetry row to be sent unsolicited."""
-        actions = SELECTING.union(self.plugin.actions)
+        actions = SELECTING_ACTIONS.union(self.plugin.actions)
         by_command = any(row.action in actions for row in self.telecommands.values())
         return by_command or SELECTION in self.parameters or self.plugin.skipped is not None
 

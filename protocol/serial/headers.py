@@ -9,7 +9,7 @@ from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.icd.conventions import NANOSECONDS, Order
 from starhil.protocol.icd.link_schema import HeaderFieldModel
 
-WRAPPING: Final = frozenset(("ticks", "time", "sequence"))
+WRAPPING_ROLES: Final = frozenset(("ticks", "time", "sequence"))
 """Roles whose values wrap around."""
 
 
@@ -114,7 +114,7 @@ class HeaderCodec:
                 value = 0
                 for name, shift, mask, _, given in bits:
                     part = given if name is None else values.get(name, given)
-                    if name in WRAPPING:
+                    if name in WRAPPING_ROLES:
                         part &= mask
                     if not 0 <= part <= mask:
                         raise self._misfit(name, part, mask.bit_length())
@@ -125,7 +125,7 @@ class HeaderCodec:
                 value = self.length(self.size(message_class), data_size)
             else:
                 value = values.get(role, default)
-            if role in WRAPPING:
+            if role in WRAPPING_ROLES:
                 packed += (value & (1 << 8 * size) - 1).to_bytes(size, order)
                 continue
             try:

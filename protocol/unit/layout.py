@@ -35,9 +35,9 @@ from starhil.protocol.messages import RequestKind
 
 NUMBER: Final = "[n]"
 _KINDS: Final[dict[str, FieldKind]] = {"f32": "float", "f64": "float", "bytes": "bytes", "text": "text"}
-_UNPLACED: Final = Field.model_construct(name="", kind="unused", slot=Slot(0, "u8", 0, 0))
+_FIELD_DEFAULTS: Final = Field.model_construct(name="", kind="unused", slot=Slot(0, "u8", 0, 0))
 """The defaults of a field."""
-_KEPT: Final = tuple(FieldKeys.model_fields)
+_KEPT_KEYS: Final = tuple(FieldKeys.model_fields)
 """Keys that a field keeps as they are."""
 SMALLEST_SCALE: Final = 1e-100
 """Smallest magnitude of a scale."""
@@ -96,7 +96,7 @@ class Layout:
                 with Located(f"field {name or 'unused'}"):
                     keys = self._keys(part, slot, number)
                 keys |= {"name": name, "provenance": provenance, "shift": shift}
-                self._append(_UNPLACED.model_copy(update=keys))
+                self._append(_FIELD_DEFAULTS.model_copy(update=keys))
                 shift += keys["width"]
 
     def _slot_of(self, model: FieldModel) -> Slot:
@@ -147,7 +147,7 @@ class Layout:
         if model.name is None and (model.value or model.argument or model.const is not None):
             raise IcdError("a field with a value, argument or const needs a name")
         given = vars(model)
-        keys = {key: given[key] for key in _KEPT}
+        keys = {key: given[key] for key in _KEPT_KEYS}
         if model.const is not None:
             keys |= {"minimum": model.const, "maximum": model.const}
         return keys | {

@@ -48,7 +48,7 @@ def _only_python_reads(word: str) -> bool:
     return "_" in word or not word.isascii()
 
 
-OMITTED: Final = "auto"
+OMITTED_VALUE: Final = "auto"
 """Value of an option whose metavar is in brackets (`[HOST:PORT]`) if it is given without one; typer does not support this."""
 
 
@@ -87,7 +87,7 @@ class FiniteCommand(_PlainHelp, TyperCommand):
         for argument, after in itertools.pairwise([*args, "--"]):
             whole.append(argument)
             if argument in optional and after.startswith("-"):
-                whole.append(OMITTED)
+                whole.append(OMITTED_VALUE)
         return super().parse_args(ctx, whole)
 
     def invoke(self, ctx: Any) -> Any:

@@ -28,12 +28,12 @@ from starid.imaging.matched_filter import (
     spot_taps,
 )
 from starid.imaging.measurement import (
-    AGAIN,
     AT_EDGE,
     BAD_FIT,
+    FIRST_ROUNDS,
     FIT_PARAMETERS,
-    FRESH,
     NOT_A_STAR,
+    REFIT_ROUNDS,
     SATURATED,
     TWICE,
     find_neighbours,
@@ -64,7 +64,7 @@ Table: TypeAlias = Array
 MIN_SIDE_PX: Final = 16
 _ASSUMED_SIGMA_PX: Final = 0.9
 _MAX_PEAKS: Final = 8192
-_HIGHER: Final = 1.5
+_THRESHOLD_STEP: Final = 1.5
 _STARS_FOR_A_GLANCE: Final = 12
 _STARS_FOR_SHAPE: Final = 30
 _PEAKS_FOR_TRAILS: Final = 300
@@ -76,7 +76,7 @@ _MIN_FOR_WIDTH: Final = 3
 _TRAIL_FILTER_PX: Final = 1.5
 _OTHER_WIDTH: Final = 0.3
 _MISFIT_SIGMA: Final = 3.0
-_RELAX: Final = 0.8
+_RELAXED_SHARE: Final = 0.8
 _MAX_NEIGHBOURS: Final = 64
 
 
@@ -397,7 +397,7 @@ def _search(
         count = search(threshold, peaks, heights)
         if count < _MAX_PEAKS:
             break
-        factor *= _HIGHER
+        factor *= _THRESHOLD_STEP
     peaks, heights = peaks[:count], heights[:count]
     rows, columns = background.level.shape
     blocks = peaks // background.block_px
@@ -455,7 +455,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
     first = np.empty(count + 1, dtype=np.int32)
     neighbours = np.empty(_MAX_NEIGHBOURS * count, dtype=np.int32)
     find_neighbours(windows, np.argsort(windows["start_y"]), first, neighbours)
-    ratio = _RELAX * settings.threshold_sigma
+    ratio = _RELAXED_SHARE * settings.threshold_sigma
     stars = np.zeros(count, FIT)
     stars["state"] = NO_FIT
     fits = _Fits(
@@ -469,7 +469,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
         stars,
         np.zeros(count, dtype=np.uint8),
     )
-    fits.measure(np.ones(count, dtype=bool), FRESH)
+    fits.measure(np.ones(count, dtype=bool), FIRST_ROUNDS)
     return fits
 
 
@@ -485,7 +485,7 @@ def _with_companions(fits: _Fits, blend_px: float) -> _Fits:
     pair_count = split_pairs(
         fits.windows, fits.pixels, *near, fits.sensor[:3], stars, suspects, blend_px, partners, owners, bad
     )
-    fits.measure(bad, AGAIN)
+    fits.measure(bad, REFIT_ROUNDS)
     owners = owners[:pair_count]
     return dataclasses.replace(
         fits,

@@ -43,7 +43,7 @@ from starid.identification.geometric.sky_grid import cell_of
 from starid.identification.geometric.verification import hit_odds, test_order
 from starid.kernels.jit import compiled_ieee, inner
 
-PAIRED: Final = 16
+PAIRED_DETECTIONS: Final = 16
 """Number of detections, brightest first, that form pairs."""
 
 CANDIDATES: Final = 6
@@ -208,10 +208,10 @@ def track_kernel(
     candidate, best, bounds = new_candidate(n), new_candidate(n), np.zeros(2)
     best.stars[:] = -1
     tests = (hit_odds(index, settings.test_window), test_order(n))
-    near = np.empty((PAIRED, CANDIDATES), dtype=np.int64)
-    counts = np.zeros(PAIRED, dtype=np.int64)
+    near = np.empty((PAIRED_DETECTIONS, CANDIDATES), dtype=np.int64)
+    counts = np.zeros(PAIRED_DETECTIONS, dtype=np.int64)
     status, bound, work = TOO_FEW if n < min_matched else NOTHING, 0.0, np.zeros(2, dtype=np.int64)
-    for j in range(min(n, PAIRED) if status == NOTHING else 0):
+    for j in range(min(n, PAIRED_DETECTIONS) if status == NOTHING else 0):
         x, y, z = without_aberration(
             *to_sky(predicted, observed, j), settings.beta_x, settings.beta_y, settings.beta_z
         )

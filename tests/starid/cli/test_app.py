@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from starhil.emulator.cli.app import COMMANDS, MOVED
+from starhil.emulator.cli.app import COMMANDS, MOVED_COMMANDS
 from starhil.emulator.sensor.renderer import render
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -69,7 +69,7 @@ def test_a_photograph_is_annotated(photograph: Path, tmp_path: Path) -> None:
     assert (pixels[:, :, 1] != pixels[:, :, 2]).any()  # circles are coloured
 
 
-@pytest.mark.parametrize(("old", "new"), MOVED.items())
+@pytest.mark.parametrize(("old", "new"), MOVED_COMMANDS.items())
 def test_an_old_name_works_and_states_the_new_one(old: tuple[str, ...], new: str) -> None:
     status, out, said = run_command_line(*old, "--help")
     assert (status, said) == (0, f"starhil {' '.join(old)}: is now starid {new}\n")
