@@ -21,7 +21,6 @@ DEFAULT_TIMEOUT_S: Final = 0.5
 """Silence within a message after which it is abandoned."""
 
 BURST_ID: Final = 119
-"""ID of the packets of a file burst."""
 
 
 class ErrorCode(IntEnum):
@@ -77,9 +76,7 @@ class FaultKind(Enum):
     UART_SHORT = "uart_short"
     """A message shorter than header and check."""
     UART_CHECK = "uart_check"
-    """A message with a wrong check."""
     UART_ADDRESS = "uart_address"
-    """A message to another address."""
     CAN_SEQUENCE = "can_sequence"
     """A segment out of order."""
     CAN_INCOMPLETE = "can_incomplete"

@@ -320,7 +320,6 @@ def _by_format(paths: Sequence[Path]) -> dict[str, Path]:
 
 
 def _as_toml(value: str | float) -> str:
-    """Write a value as TOML."""
     if isinstance(value, (int, float)):
         return str(value)
     return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -186,7 +186,6 @@ class ControlServer:
             return {"ok": False, "error": f"internal error: {name}; see the emulator's log"}
 
     def _head(self, request: dict[str, Any]) -> Head:
-        """Return the head that a request selects."""
         number, heads = request.pop("head", 1), self._run.heads
         if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= len(heads):
             raise EmulatorError(f"head: must be 1 to {len(heads)}, not {number!r}")
@@ -295,8 +294,6 @@ class ControlServer:
 
 
 class _Truth(BaseModel):
-    """Arguments of `set_truth`."""
-
     truth: TruthConfig
 
 

@@ -30,7 +30,6 @@ class ConsoleOptions:
     """Options of console and recorders, which use images and have an OBC on the bus of each head."""
 
     make_client: MakeClient
-    """Makes the OBC."""
     view: str = "off"
     """Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT."""
     view_token: str = ""

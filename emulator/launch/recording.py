@@ -101,7 +101,6 @@ class RecordedRun:
     ends: bool
     """Whether its tape ends with the entry `end`."""
     machine: Mapping[str, str]
-    """Machine on which it was recorded."""
 
 
 def read_run(folder: Path) -> RecordedRun:

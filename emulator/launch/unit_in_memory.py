@@ -119,7 +119,6 @@ class _InternalErrors(logging.Handler):
         self.texts: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a message."""
         self.texts.append(record.getMessage())
 
 

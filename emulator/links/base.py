@@ -58,7 +58,6 @@ class Link(ABC, Generic[Item]):
         self._requests = requests
         self.transport: Final = transport
         self.obc_requests: Final = ObcRequests()
-        """Requests of the OBC."""
         self.wire: WireFaults[Item] = WireFaults(self._transmit, damage, device.clock, device.scheduler, seed)
         """Outgoing side of the link, with its faults."""
         self._timer: Event | None = None
@@ -101,7 +100,6 @@ class Link(ABC, Generic[Item]):
 
 
 AnyLink: TypeAlias = Link[Any]
-"""An open link of any kind."""
 
 
 class Phase(Enum):
@@ -198,7 +196,6 @@ class RequestLink(Link[Item], Generic[Item, Style]):
                 self._style_changed(before)
 
     def _send_unsolicited(self, reply: Reply) -> None:
-        """Send unsolicited telemetry."""
         if self._exchange.phase is Phase.EXECUTING:
             self._exchange.caused.append(reply)
         else:

@@ -288,7 +288,6 @@ class CanopenLink(Link[CanFrame]):
         self._run_action(self.slave.tick)
 
     def _handle_event(self, event: SlaveEvent) -> None:
-        """Handle an event reported by the slave."""
         match event.kind:
             case EventKind.TIME:
                 self._device.time.set_unix_ns(round(event.value * 1000) * MILLISECOND_NS)

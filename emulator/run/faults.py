@@ -166,9 +166,7 @@ class FaultRequest(Strict):
     optical: SkyValues | None = None
     """Objects in addition to the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
     device: DeviceFault | None = None
-    """Fault of the device."""
     serial: WireFault | None = None
-    """Faults of the serial line."""
     can: WireFault | None = None
     """Faults of outgoing CAN frames, including CANopen."""
 

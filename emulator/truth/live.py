@@ -55,8 +55,6 @@ RESTART_S: Final = 1.0
 
 @dataclass(frozen=True)
 class _HeldMessage:
-    """The truth of an accepted message."""
-
     t: float
     """Simulation time, seconds."""
     state: TruthState

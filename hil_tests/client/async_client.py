@@ -54,7 +54,6 @@ class AsyncObcClient:
         self.unsolicited: defaultdict[str, asyncio.Queue[Reading]] = defaultdict(
             lambda: asyncio.Queue(UNSOLICITED_KEPT)
         )
-        """Unsolicited readings by row."""
         self.unsolicited_dropped = 0
         self.bursts: asyncio.Queue[bytes] = asyncio.Queue()
         self._turn = asyncio.Lock()

@@ -91,7 +91,6 @@ def _bad_data(row: Row) -> list[bytes]:
 
 
 def _message(number: str, data: bytes) -> list[str]:
-    """Return the segments of a telecommand."""
     return [f"07{number}{{host}}{{device}}#{part.hex().upper()}" for part in segments(data)]
 
 

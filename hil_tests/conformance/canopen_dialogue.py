@@ -168,7 +168,6 @@ Answer = Annotated[str, _answer]
 
 
 def _check(response: bytes | None, answer: str) -> None:
-    """Check the answer to a request."""
     kind, *details = answer.split()
     match kind:
         case "silence":

@@ -80,7 +80,6 @@ def _entry(item: ODVariable) -> str:
 
 
 def _mapping(item: ODVariable) -> str:
-    """Return the mapping entry of a variable."""
     return f"0x{item.index:04x}{item.subindex:02x}{8 * (size_of(item) or 0):02x}"
 
 

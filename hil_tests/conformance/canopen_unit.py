@@ -157,7 +157,6 @@ def _restarts(command: Row, probe: CanopenProbe) -> None:
 
 
 def _fields(entry: Entry) -> list[Field]:
-    """Return the telemetry fields of an entry."""
     fields = () if entry.row is None else entry.row.named.values()
     return [field for field in fields if entry.slot is not None and field.offset == entry.slot.offset]
 

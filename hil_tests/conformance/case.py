@@ -121,7 +121,6 @@ class Case(Generic[ProbeType]):
     id: str
     """Dotted name, unique: link, area, check."""
     area: str
-    """Area of the protocol."""
     title: str
     """The checked behaviour, one line."""
     clause: str

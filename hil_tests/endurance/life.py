@@ -93,9 +93,7 @@ class Life:
     unit: str
     """Name or folder."""
     seed: int
-    """Seed of the life and of the noise in it."""
     links: tuple[str, ...]
-    """The links that are open."""
     profile: dict[str, Any]
     steps: tuple[Step, ...]
     rendered: bool = False

@@ -28,7 +28,6 @@ SDO_SIZE: Final = 8
 EXPEDITED, SEGMENT = 4, 7
 """Maximum number of bytes in an expedited SDO, and in a segment."""
 ABORT: Final = 0x80
-"""Command of an abort."""
 
 Exchange = Callable[[bytes], bytes | None]
 """Sends an SDO request, and returns the response, None without one; it fills the request up to 8 bytes."""

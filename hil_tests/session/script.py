@@ -111,7 +111,6 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
 
 
 def _step(where: str, table: dict[str, Any], context: dict[str, Any]) -> tuple[Step | None, list[str]]:
-    """Check a step; return it, or its problems."""
     present = [key for key in ACTIONS if key in table]
     if len(present) == 1:
         return _checked(ACTIONS[present[0]], table, where, context)

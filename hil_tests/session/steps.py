@@ -114,7 +114,6 @@ def _of_one_link(items: list[bytes | CanFrame]) -> list[bytes | CanFrame]:
 
 
 def _as_list(value: Any) -> Any:
-    """Return a list of a single text."""
     return [value] if isinstance(value, str) else value
 
 
@@ -165,7 +164,6 @@ class SessionState:
     """Gets CSV and image files."""
     truth: Quaternion | TruthLogReader | None
     captured: dict[str, Value] = field(default_factory=dict)
-    """Value of each variable."""
     step_begin_s: float = 0.0
     """Begin of the present step, on `time.monotonic`."""
 
@@ -196,7 +194,6 @@ class Attempt:
     values: Mapping[str, Value] = field(default_factory=dict)
     """Telemetry read."""
     figures: dict[str, float] = field(default_factory=dict)
-    """Computed numbers."""
     latency_s: float | None = None
     """Largest latency, s."""
 

@@ -42,8 +42,6 @@ class _Signal(NamedTuple):
 
 
 class _Message(NamedTuple):
-    """One message of the database."""
-
     can_id: int
     """With the flag `EXTENDED`."""
     name: str

@@ -223,8 +223,6 @@ def _dotted(document: Any, location: Sequence[int | str]) -> str:
 
 
 class _Key(NamedTuple):
-    """The value of a key of a table."""
-
     annotation: Any
     models: list[type[BaseModel]]
     """Models of the tables in it."""
@@ -234,7 +232,6 @@ class _Key(NamedTuple):
 
 @cache
 def _keys_of(model: type[BaseModel]) -> dict[str, _Key]:
-    """Return the keys of a table."""
     annotations = {field.alias or name: field.annotation for name, field in model.model_fields.items()}
     return {
         key: _Key(annotation, _models_in(annotation), get_origin(annotation) is dict)

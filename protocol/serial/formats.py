@@ -29,7 +29,6 @@ class MessageFormat:
 
     framing: Framing
     model: FramingModel
-    """Keys of the framing."""
     check: Check
     header: HeaderCodec
     classes: Sequence[str] = ()

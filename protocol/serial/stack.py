@@ -88,7 +88,6 @@ class SerialStack:
             for form in self.request_formats.all
             if any(row.request for row in rows if self.request_formats.of(row.message_class) is form)
         ]
-        """Formats of requests that are texts."""
         self.requests: Final = self.request_formats.other
         """Format of requests without a class."""
         self.replies: Final = self.reply_formats.other

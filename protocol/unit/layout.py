@@ -38,7 +38,6 @@ _KINDS: Final[dict[str, FieldKind]] = {"f32": "float", "f64": "float", "bytes": 
 _FIELD_DEFAULTS: Final = Field.model_construct(name="", kind="unused", slot=Slot(0, "u8", 0, 0))
 """The defaults of a field."""
 _KEPT_KEYS: Final = tuple(FieldKeys.model_fields)
-"""Keys that a field keeps as they are."""
 SMALLEST_SCALE: Final = 1e-100
 """Smallest magnitude of a scale."""
 MAX_NAMES: Final = 256

@@ -137,7 +137,6 @@ class _Reader:
     # --- files ---
 
     def _read(self, file: Path) -> None:
-        """Read and validate one file."""
         try:
             document = read_user_toml(file)
         except OSError as error:

@@ -247,7 +247,6 @@ class _Bundle:
         self.prior = (self.free_to_all.T * prior**-2.0) @ self.free_to_all
 
     def start(self) -> _State:
-        """The start values."""
         attitudes = tuple(
             solve_wahba(self.camera.back_project(f.xy_px), f.reference) if f.attitude is None else f.attitude
             for f in self.frames

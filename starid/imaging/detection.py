@@ -327,7 +327,6 @@ def _checked_image(image: npt.NDArray[np.generic]) -> GreyImage:
 
 
 def _no_detections(background: Background, reason: str, rejected: int = 0) -> Detections:
-    """Return empty detections with a reason."""
     none = np.zeros(0)
     pairs = np.zeros((0, 2))
     no = np.zeros(0, dtype=bool)

@@ -178,7 +178,6 @@ class RoughSearch:
         return solution.timed(begin)
 
     def _attempts(self, xy: Array, flux: Array, rounds: Sequence[int]) -> Iterator[_Attempt]:
-        """Yield the attempts of some rounds."""
         brightest = np.argsort(-flux, kind="stable")
         known_lens = any(self._first.camera.distortion)
         for number in rounds:

@@ -358,7 +358,6 @@ class AreaPainter:
         return [Patch(box, light, passed)]
 
     def _wide_earth(self, earth: EarthLimb, attitude: Attitude) -> WideEarth:
-        """Return the Earth on the grid."""
         nadir, sun = self._earth_and_sun(earth, attitude)
         directions = self._grid_directions
         grid = np.empty_like(directions)

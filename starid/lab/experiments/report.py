@@ -76,7 +76,6 @@ def counts(results: Sequence[FinishedExperiment]) -> dict[str, dict[str, int]]:
 
 
 def _named_rows(results: Iterable[FinishedExperiment]) -> list[tuple[str, Row]]:
-    """All rows with the names of their experiments."""
     return [(result.experiment.name, row) for result in results for row in result.outcome.rows]
 
 

@@ -263,7 +263,6 @@ class _Field:
 
 
 def _run_row(row: str, frames: int, seed: int, field_of: _Field, budget_s: float) -> list[Tally]:
-    """All solvers on the scenes of one row."""
     settings, maker, solvers = ROWS[row], field_of.maker, field_of.solvers
     tallies = {name: Tally(row, name) for name in solvers}
     spent = dict.fromkeys(solvers, 0.0)
