@@ -1,4 +1,4 @@
-"""The `starhil` command: what concerns a device. The numerics and the laboratory have the command `starid`."""
+"""The `starhil` command, for everything that concerns a device; `starid` is the command of the numerics and the laboratory."""
 
 from __future__ import annotations
 

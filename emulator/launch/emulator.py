@@ -1,4 +1,4 @@
-"""What a user asks for around a run: logs, recording, scenario, control channel and console."""
+"""What a user can add to a run: logs, recording, scenario, control channel and console."""
 
 from __future__ import annotations
 

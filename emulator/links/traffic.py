@@ -1,4 +1,4 @@
-"""The traffic on the links of a head: reported as it passes, and decoded for people."""
+"""The traffic on the links of a head: reported as it passes, and decoded for display."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An asynchronous OBC client, which uses the names of the interface definition."""
+"""Asynchronous OBC client; rows and fields have their names in the interface definition."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A synchronous OBC client, which uses the names of the interface definition."""
+"""Synchronous OBC client; rows and fields have their names in the interface definition."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ class HostLink(ABC, Generic[Item]):
         """Return whether unsolicited telemetry of a class says that it is."""
         return True
 
-    def is_from_device(self, item: Item) -> bool:  # noqa: ARG002 -- nobody else sends on a line
+    def is_from_device(self, item: Item) -> bool:  # noqa: ARG002 -- a serial line has only one peer
         """Return whether the device has sent a received item."""
         return True
 

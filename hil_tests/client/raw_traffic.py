@@ -1,4 +1,4 @@
-"""Raw bytes and CAN frames as text, in sessions and conformance cases; sending them, and comparing the answer with a pattern."""
+"""Raw bytes and CAN frames as text, for sessions and conformance cases: parsing, sending, and comparing answers with patterns."""
 
 from __future__ import annotations
 

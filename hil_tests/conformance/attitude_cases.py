@@ -1,4 +1,4 @@
-"""Cases on the attitudes in a row, on any link: |q| = 1, invalid in standby, one attitude in all forms, and the truth if it is given."""
+"""Attitude cases for any link: |q| = 1, invalid in standby, agreement of all forms, and of each with the truth if it is known."""
 
 from __future__ import annotations
 

@@ -4,9 +4,9 @@
     70 > abort TOGGLE {text}
     if 1003 kept 1003:0
 
-They are in areas with `links = ["canopen"]` of a file of cases (`case_file`), in the language of `dialogue`.
-`REQUEST > ANSWER` sends bytes by SDO, padded to 8, and looks at the next answer of the node; without a request, it looks at
-the answer after that. An answer is one of
+The language is that of `dialogue`, and the cases are in areas with `links = ["canopen"]` of a file of cases (`case_file`).
+`REQUEST > ANSWER` sends bytes by SDO, padded to 8, and checks the next answer of the node; `> ANSWER` checks the one after
+that. An answer is one of
 
     60 {text} 00000000      these bytes; `..` is any byte, a final `*` any others
     abort A|B MUX           an abort with one of these codes, for this object if one is given
@@ -16,7 +16,7 @@ the answer after that. An answer is one of
     silence, *, -           no answer; any answer or none; do not wait
     silence or abort A      one of several answers
 
-Frames are sent, and the next frame with the CAN ID of the answer must be like it, within 0.5 s:
+Frames are sent as they are; of the answer, the next frame with its CAN ID is checked, which must arrive within 0.5 s:
 
     000#03{node}            sends a frame; `080#R` a remote frame, `00000000#01` one with a CAN ID of 29 bits
     > {tpdo_id}#2a..        takes a frame; {tpdo_id}#* one with any data

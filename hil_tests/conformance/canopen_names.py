@@ -1,7 +1,7 @@
-"""Names in braces of a dialogue: objects of the node that fit a purpose, their values, and CAN IDs.
+"""Names in braces of a dialogue: suitable objects of the node, their values, and CAN IDs.
 
-Names that belong together are found together, before the first request of the dialogue; a case whose names the EDS
-has no object for is skipped. Multiplexers, data and CAN IDs are in hexadecimal, mapping entries with `0x`.
+Related names are found together, before the first request of the dialogue; if the EDS has no object for one of them, the
+case is skipped. Multiplexers, data and CAN IDs are in hexadecimal, mapping entries with `0x`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The language of conformance cases that are written as text, on every link: what is sent, and what must come back.
+"""The language of conformance cases written as text, for all links: what is sent, and what must come back.
 
     1F 7F 80 1F FF > 128                serial line: bytes, and the telemetry of row 128
     1F 7F 03 1F FF > 3!crc              ... or the refusal of row 3, by the name of an error
@@ -14,7 +14,8 @@ in braces are those of the file (`case_file`), of the unit and of the link. In a
     telemetry status a=1 b=true         a row with these values; of two for one field, the last
     finally                             the steps from here on follow in any case, also if one before has failed
 
-On a serial line and on CAN, at the end nothing more may come, and the next request must be answered; there is
+On a serial line and on CAN there is one more verb. At the end of a case, nothing more may come, and the next request must
+be answered.
 
     silence, silence 0.8                nothing comes within a time, s
 """

@@ -1,7 +1,7 @@
 """Conformance on the serial line: framing, check, header, echoes, pace and recovery, for the link of any unit.
 
-The cases of a CubeSpace line at its limits are bytes in a file; those of a composed line change one part of a message
-that the judge has written.
+Edge cases of a CubeSpace line are bytes in a file; those of a composed line alter one part of a message that the judge has
+encoded.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What no derived case judges: values in telemetry of which only the limits are known. They are listed as skipped."""
+"""Telemetry values that no derived case can judge, because only their limits are known; they are listed as skipped."""
 
 from __future__ import annotations
 

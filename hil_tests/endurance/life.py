@@ -9,8 +9,8 @@ A step is a JSON object with `do`:
 ``request``        `link`, `row` ("class id"), `data`: send a request and judge the answers
 ``burst``          `link`, `rows`: send telemetry requests without waiting; the answers come in order
 ``flood``          `link`, `row`, `data`, `count`: send the same request many times, so that counters of 16 bits wrap
-``cut``            `link`, `row`, `share`: send the first part of a request, as a client that goes away; another comes
-``nmt``            `link`, `command`: an NMT command, by which a CANopen node begins or ends to send PDOs
+``cut``            `link`, `row`, `share`: send the first part of a request, as by a client that disconnects; another one connects
+``nmt``            `link`, `command`: an NMT command, which starts or stops the PDOs of a CANopen node
 ``junk``           `link`, `data` or `frames`: send input that is not a request for this unit; nothing may answer
 ``truth``          `truth`: a table as `[truth]` in a profile
 ``fault``          `fault`: a request of faults as on the control channel; ``clear`` ends all faults
@@ -22,7 +22,7 @@ A step is a JSON object with `do`:
 =================  ==================================================================================================
 
 Two kinds of lives: in most, everything happens and power is switched often. In a long one, the unit is left alone for
-days, without resets and with the lowest update rates, so that its counters and clocks pass their wraps while observed.
+days, without resets and with the lowest update rates, so that its counters and clocks wrap around under observation.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""The OBC of a life: sends requests on every link, and judges what comes back and what comes by itself.
+"""The OBC of a life: sends requests on every link, and judges replies and unsolicited messages.
 
-Each request gets exactly the answers that the definition names; the oracle says whether it must be accepted. On a
-link that a fault disturbs, and after a request with an unknown outcome, nothing is judged but the oracle forgets.
-What comes without a request is heard at the end of each step, in the order of its times, and judged as of then.
+Each request must get exactly the answers that the definition names; the oracle decides whether it must be accepted. On a
+link disturbed by a fault, and after a request with an unknown outcome, nothing is judged, and the oracle no longer relies
+on what may have changed. Unsolicited messages are read at the end of each step, in order of time, and judged as of then.
 """
 
 from __future__ import annotations

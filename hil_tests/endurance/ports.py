@@ -1,6 +1,6 @@
 """The OBC's end of each link of a unit in memory: requests out, answers in, each with the time at which it was sent.
 
-Requests are encoded and answers decoded by the judge, not by the product's codecs, so that an error of a codec is seen.
+Requests are encoded and answers decoded by the judge, not by the product's codecs, so that errors of a codec are found.
 """
 
 from __future__ import annotations

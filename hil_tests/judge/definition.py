@@ -1,8 +1,8 @@
 """The definition as data: the one module of the judge that knows the types of `starhil.protocol`.
 
 It copies what the TOML files say, field by field. What follows from it (offsets, bit positions, sizes) is counted
-here from the order of the fields, so that an error of the product's layout is not copied. Shared on purpose, and
-said so in docs/rules.md: the reader of the TOML files; the framing and check of a unit's own plugin.
+here from the order of the fields, so that an error of the product's layout is not copied. Deliberately shared, as
+docs/rules.md says: the reader of the TOML files, and the framing and check of a unit's own plugin.
 """
 
 from __future__ import annotations

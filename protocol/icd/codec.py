@@ -1,10 +1,10 @@
 """Codec of the rows of an interface definition: physical values to wire bytes and back.
 
-A `Field` is the keys of its definition (`icd_schema.FieldKeys`) with its place in the bytes of a row; it converts
+A `Field` is the keys of its definition (`schema.FieldKeys`) with its place in the bytes of a row; it converts
 between raw and physical values, checks limits, and names row and field in its errors. A `Row` is compiled at its
-first use: one `struct.Struct` for each run of slots of one byte order, and shifts for bits. Built of construct, the
-same rows take 2.1 to 5.0 times as long (the 39 fields of `star_tracker`: 68 against 146 µs to encode, 23 against 89
-µs to decode; the 3 of `quaternion`: 8 against 19 and 2.6 against 12.9), and as many lines.
+first use: one `struct.Struct` for each run of slots of one byte order, and shifts for bits. The same
+rows built on construct took 2.1 to 5.0 times as long (`star_tracker` with 39 fields: 146 instead of 68 µs to encode, 89
+instead of 23 µs to decode; `quaternion` with 3: 19 instead of 8 µs, 12.9 instead of 2.6 µs), and as many lines of code.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The interface definition of a unit, indexed by name and ID; `icd` reads it from TOML files."""
+"""The interface definition of a unit, indexed by name and ID; `starhil.protocol.unit.reader` reads it from TOML files."""
 
 from __future__ import annotations
 

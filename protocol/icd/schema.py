@@ -1,7 +1,8 @@
 """The keys of the files of a unit: models that reject unknown keys and wrong types.
 
-Attributes that differ from their key have the key as alias. What a field keeps when `icd_layout` places it in a row
-is in `FieldKeys`, what a row keeps is in `RowKeys`; `codec.Field` and `codec.Row` add bytes to these.
+An attribute whose name differs from its key has the key as alias. `FieldKeys` are the keys that a field keeps when
+`starhil.protocol.unit.layout` places it in a row, `RowKeys` those that a row keeps; `codec.Field` and `codec.Row` extend
+them with positions in the bytes.
 """
 
 from __future__ import annotations

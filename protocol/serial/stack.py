@@ -6,7 +6,7 @@
             └──────────────── body ─────────────────────────┘
 
 A link is composed of a framing, which marks where a body begins and ends (`framings`), a check (`checks`), a header of
-requests and one of replies (`envelope`), whose roles give the kind of a reply. Only the replies of CubeSpace have another
+requests and one of replies (`headers`), whose roles give the kind of a reply. Only CubeSpace's replies have a separate
 header for each kind, and dialects (`cubespace`).
 """
 

@@ -1,7 +1,7 @@
-"""From the fields of a definition to the fields of a row: expanded, named, and placed in bytes one after another.
+"""Expands the fields of a definition into the fields of a row, and lays them out in bytes.
 
-One field of the definition can be several of the row: `count` and `repeat` number them, `bits` share a slot, and a
-text is short for one line of an ICD table. `TYPE NAME [UNIT] [SCALE]` is a number, `enumN NAME ENUMERATION` an
+One field of a definition may expand to several: `count` and `repeat` number them, and `bits` share a slot. A text is
+shorthand for one line of an ICD table. `TYPE NAME [UNIT] [SCALE]` is a number, `enumN NAME ENUMERATION` an
 enumeration, `bytes NAME SIZE` and `text NAME SIZE` a string, and `bits NAME[:WIDTH] …` flags and groups of bits,
 lowest first, which fill whole bytes. `-` means no name or no unit. Braces repeat the field as in a shell:
 `i16 mag{0,1}_{x,y,z} uT 0.01` is six fields, `u8 css{0..9}` is ten.

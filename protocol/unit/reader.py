@@ -1,9 +1,9 @@
 """Reads the interface definition of a unit from its TOML files, or lists all errors in them.
 
-The files are validated one by one (`icd_schema`). What is invalid is removed, so that the rest can still be checked,
-and the names that are missing because of that are noted: an error that another one may cause is left out. Then the
-tables of all files are put together in the order of their references: enumerations, parameters, rows, links. An
-error names file, table and key, and what to write instead.
+Each file is validated on its own (`starhil.protocol.icd.schema`). Invalid parts are dropped so that the rest can still be
+checked, and errors that may only follow from a dropped part are not reported. The tables of all files are then combined
+in order of their references: enumerations, parameters, rows, links. An error names the file, the table and the key, and
+says what to write instead.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 A program is a table of sub-commands, each a module with a function `command` or a `group` of sub-commands. Only the
 module of the sub-command that was given is imported (all of them for the help), and these modules import slow
-packages inside their functions. Whatever a command raises of its program's errors, the system's, or for want of an
-extra of the installation ends the program with one line on stderr.
+packages inside their functions. An error of the program or of the system, or a
+missing optional dependency, ends the program with one line on stderr.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The points of the vendor's interface document as cases; the clause is the page of its public copy, whose revision is unknown.
 
-Messages are made and taken apart here, byte by byte, so that the cases need nothing that the definition says. A unit with
-another address than 0Eh would answer none of them.
+Messages are built and parsed here byte by byte, so that the cases do not depend on the definition. A unit whose address is
+not 0Eh answers none of them.
 """
 
 from __future__ import annotations
