@@ -38,12 +38,7 @@ LENGTH_ADDRESS = 0x4C
 COUNTER_ADDRESS = 0x50
 """Framing errors, runts, oversize messages, bad CRCs, FIFO overflows, u32 each: which are counted, and when, is in 1-35919; the
 address is ours."""
-COUNTED_FAULTS = (
-    FaultKind.UART_PROTOCOL,
-    FaultKind.UART_SHORT,
-    FaultKind.UART_OVERLONG,
-    FaultKind.UART_CHECK,
-)
+FAULTS = (FaultKind.UART_PROTOCOL, FaultKind.UART_SHORT, FaultKind.UART_OVERLONG, FaultKind.UART_CHECK)
 """Faults of the first four counters; the FIFO never overflows."""
 ANALOG = {
     "mcu_current": 0.1, "bus_voltage": 5.0, "core_voltage": 1.2, "mcu_voltage": 3.3, "io_voltage": 3.3, "mcu_temperature": 20.0,
@@ -197,7 +192,7 @@ def edac(state: Sequence, snapshot: Any) -> bytes:
     """Return EDAC memory: what was written, and over it what the unit keeps there."""
     memory = bytearray(state.memory)
     done = state.code & ON and snapshot.frames > state.frames
-    counters = [snapshot.counters.faults.get(kind, 0) for kind in COUNTED_FAULTS] + [0]
+    counters = [snapshot.counters.faults.get(kind, 0) for kind in FAULTS] + [0]
     for address, data in (
         (ANALOG_ADDRESS, analog(snapshot)),
         (LENGTH_ADDRESS, struct.pack("<I", len(whole_result(state, snapshot)) if done else 0)),
