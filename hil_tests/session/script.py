@@ -13,7 +13,9 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.session.expect import Keys, StatedAttitude
-from starhil.hil_tests.session.steps import ACTIONS, FileName, Link, Step, Texts, Timeout
+from starhil.hil_tests.session.step import Step
+from starhil.hil_tests.session.step_keys import FileName, Link, Texts, Timeout
+from starhil.hil_tests.session.steps import ACTIONS
 from starhil.protocol.errors import MAX_PROBLEMS, did_you_mean
 from starhil.protocol.files.user_file import TomlError, read_user_toml
 from starhil.protocol.files.validation import problems
