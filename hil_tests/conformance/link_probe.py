@@ -237,7 +237,7 @@ class LinkProbe(Probe):
     def ask(self, row: Row | int, data: bytes = b"", message_class: str = "") -> Answer:
         """Send a request and return the answer; of an answer in several parts, the last.
 
-        Other rows that answer a request follow its reply, or stand for it.
+        Other rows that answer a request follow its reply, or replace it.
         """
         others = []
         if isinstance(row, Row):
