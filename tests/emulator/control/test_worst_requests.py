@@ -12,7 +12,8 @@ from starhil.emulator.control import channel, scenario
 from starhil.emulator.control.channel import MAX_LINE
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
-from starhil.emulator.sensor.sky.objects import MAX_ROWS, SkyObjects
+from starhil.emulator.sensor.sky.objects import MAX_ROWS
+from starhil.emulator.sensor.sky.tables import OPTICAL_FAULT
 from starhil.emulator.truth.config import MAX_SEGMENTS
 from starhil.emulator.truth.feed import MAX_LINES, LiveFeed, _Datagrams
 from starhil.emulator.truth.live import LiveTruth
@@ -85,11 +86,11 @@ def test_a_scenario_and_a_sky_have_limits() -> None:
     planet = {"ra_deg": 1.0, "dec_deg": 2.0, "magnitude": 3.0}
     for rows in ({"planets": [planet]}, {"obstructions": [{}]}):
         ((name, row),) = rows.items()
-        SkyObjects.from_dict({name: row * MAX_ROWS})
-        with pytest.raises(EmulatorError, match=f"sky {name}: must have at most {MAX_ROWS} items, not 201"):
-            SkyObjects.from_dict({name: row * (MAX_ROWS + 1)})
-    with pytest.raises(EmulatorError, match="polygon_px: must have at most"):
-        SkyObjects.from_dict({"obstructions": [{"polygon_px": [[0.0, 0.0]] * (MAX_ROWS + 1)}]})
+        OPTICAL_FAULT.model_validate({name: row * MAX_ROWS})
+        with pytest.raises(ValueError, match=f"{name}\n.* at most {MAX_ROWS} items .* not 201"):
+            OPTICAL_FAULT.model_validate({name: row * (MAX_ROWS + 1)})
+    with pytest.raises(ValueError, match=f"polygon_px\n.* at most {MAX_ROWS} items"):
+        OPTICAL_FAULT.model_validate({"obstructions": [{"polygon_px": [[0.0, 0.0]] * (MAX_ROWS + 1)}]})
 
 
 def test_a_datagram_is_read_up_to_a_number_of_lines_and_a_length() -> None:
