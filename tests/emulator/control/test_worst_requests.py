@@ -108,11 +108,17 @@ def test_a_datagram_is_read_up_to_a_number_of_lines_and_a_length() -> None:
 
 def test_the_rest_of_a_file_with_very_many_errors_is_not_checked(tmp_path: Any) -> None:
     profile = tmp_path / "profile.toml"
-    profile.write_text("[sensor]\n" + "".join(f"gian{number} = 1\n" for number in range(5000)))
+    keys = "".join(f"gian{number} = 1\n" for number in range(5000))
+    profile.write_text(f"[parameters]\n{keys}")
     with pytest.raises(EmulatorError) as caught:
         load_profile(str(profile))
     assert len(caught.value.args) == MAX_PROBLEMS
     assert "4981 more keys are not checked; correct these first" in str(caught.value)
+    profile.write_text(f"[sensor]\n{keys}[sky]\n{keys}")
+    with pytest.raises(EmulatorError) as caught:
+        load_profile(str(profile))
+    assert len(caught.value.problems) == MAX_PROBLEMS + 1
+    assert caught.value.problems[-1] == "and 9980 more"
     session = tmp_path / "session.toml"
     session.write_text("[[step]]\ntelemetri = 'x'\n" * 5000)
     with pytest.raises(ScriptError, match="4980 more steps are not checked; correct these first") as wrong:
