@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from starhil.protocol.files.bundled import Kind
 
 
-NAMED: Final[dict[Kind, str]] = {"unit": "--starhil-unit", "profile": "--starhil-profile"}
+FILE_OPTIONS: Final[dict[Kind, str]] = {"unit": "--starhil-unit", "profile": "--starhil-profile"}
 """Options that name what ships with the package, or a file."""
 _OF_EMULATOR: Final = (None, "auto", "off")
 """Values of the options of links that name no unit."""
@@ -74,7 +74,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", "starhil(profile=None, settings=()): profile and settings of the emulator for a test"
     )
-    for kind, option in NAMED.items():
+    for kind, option in FILE_OPTIONS.items():
         if (name := config.getoption(option)) is not None:
             from starhil.protocol.files.bundled import find, not_found
 

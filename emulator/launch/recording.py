@@ -28,7 +28,7 @@ from starhil.protocol.files.validation import problems
 Model = TypeVar("Model", bound=BaseModel)
 
 
-_COPIED: Final = [(key.split("."), mark.recorded_as) for key, mark in PATHS.items() if mark.recorded_as]
+_COPIED_KEYS: Final = [(key.split("."), mark.recorded_as) for key, mark in PATHS.items() if mark.recorded_as]
 """Keys of files that a recording has a copy of, and the name of the copy."""
 
 
@@ -60,7 +60,7 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     values = profile.model_dump(mode="json")
     # what the profile does not set is the unit's, which may have no dialects and another bit rate
     values["links"]["serial"] = profile.links.serial.model_dump(mode="json", exclude_unset=True)
-    for keys, name in _COPIED:
+    for keys, name in _COPIED_KEYS:
         table, key = _table_of(values, keys)
         if key in table:
             shutil.copyfile(profile.folder / table[key], folder / name)
@@ -96,7 +96,6 @@ class RecordedRun:
 
     profile: Profile
     machine: Mapping[str, str]
-    """Machine on which it was recorded."""
 
 
 def read_run(folder: Path) -> RecordedRun:
@@ -108,7 +107,7 @@ def read_run(folder: Path) -> RecordedRun:
         raise EmulatorError(f"{error}; give a folder made by starhil run --record") from None
     run = validated(_RunFile, text, path)
     values = run.profile.model_dump(exclude_unset=True)
-    for keys, name in _COPIED:
+    for keys, name in _COPIED_KEYS:
         table, key = _table_of(values, keys)
         if table.get(key) == name:
             table[key] = str((folder / name).absolute())

@@ -265,8 +265,6 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
 
 
 class _Playing:
-    """Plays entries one by one."""
-
     def __init__(
         self, run: Run, head: Head, player: Player, pipeline: PlayedPipeline, warm: PipelineReady
     ) -> None:

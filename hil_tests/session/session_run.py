@@ -197,8 +197,8 @@ def _emulator(
     request: SessionRequest, script: Script, options: LinkOptions, folder: Path, state: Path
 ) -> EmulatorProcess:
     """Prepare an emulator for the session, with an empty parameter store."""
-    wanted = script.emulator
-    beside = find_script(request.script).parent / (wanted.profile or "")
+    section = script.emulator
+    beside = find_script(request.script).parent / (section.profile or "")
     truth_log = None
     if script.truth.file is not None and request.truth is None:
         truth_log = folder / script.truth.file
@@ -206,13 +206,13 @@ def _emulator(
     extra += ["--control", "auto"] if any(isinstance(step, Control) for step in script.steps) else []
     return EmulatorProcess(
         emulator_command(
-            profile=request.profile or (str(beside) if beside.is_file() else wanted.profile),
+            profile=request.profile or (str(beside) if beside.is_file() else section.profile),
             unit=request.unit,
             serial=options.serial or "off",
             can=options.can or "off",
             dialect=options.dialect,
-            seed=wanted.seed,
-            settings=pointed(script.truth.attitude, wanted.settings),
+            seed=section.seed,
+            settings=pointed(script.truth.attitude, section.settings),
             state_dir=state,
             truth_log=truth_log,
             extra=extra,

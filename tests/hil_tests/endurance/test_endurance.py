@@ -27,7 +27,7 @@ from starhil.emulator.launch.unit_in_memory import links_of
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.hil_tests.endurance.attitude_judge import Motion
-from starhil.hil_tests.endurance.life import UNRECORDED, Life, Outcome, make_life
+from starhil.hil_tests.endurance.life import UNRECORDED_STEPS, Life, Outcome, make_life
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.violating_life import kind_of, shortened
 from starhil.hil_tests.judge.definition import unit_of
@@ -343,7 +343,7 @@ def test_a_life_with_a_full_disk_is_written_without_a_recording(tmp_path):
 
 def test_the_recording_of_a_life_is_repeated_to_the_byte(tmp_path):
     life = life_of("sagitta", 7, 60)
-    life = replace(life, steps=tuple(step for step in life.steps if step["do"] not in UNRECORDED))
+    life = replace(life, steps=tuple(step for step in life.steps if step["do"] not in UNRECORDED_STEPS))
     outcome = run_once(life, record=tmp_path / "recording")
     assert outcome.violation == ""
     report = asyncio.run(replay(tmp_path / "recording"))
