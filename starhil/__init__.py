@@ -9,7 +9,14 @@ folders.
 from __future__ import annotations
 
 import importlib
+import os.path
 from typing import TYPE_CHECKING, Final
+
+if os.path.isfile(os.path.join(os.path.dirname(__file__), "emulator")):  # noqa: PTH113, PTH118, PTH120 -- pathlib loads slowly
+    raise ImportError(
+        "starhil: this checkout was unpacked without its symbolic links (starhil/emulator is a file); clone it with git, "
+        "on Windows in WSL, or unpack it with tar"
+    )
 
 if TYPE_CHECKING:
     from starhil.emulator.errors import EmulatorError as EmulatorError

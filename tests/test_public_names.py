@@ -40,6 +40,18 @@ def test_importing_starhil_loads_none_of_its_parts():
     assert done.stdout.split() == []
 
 
+def test_a_checkout_without_symbolic_links_says_so(tmp_path):
+    folder = tmp_path / "starhil"
+    folder.mkdir()
+    (folder / "__init__.py").write_text(Path(starhil.__file__).read_text(encoding="utf-8"), encoding="utf-8")
+    (folder / "emulator").write_text("../emulator")
+    command = [sys.executable, "-c", "import starhil"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.stderr.splitlines()[-1].startswith(
+        "ImportError: starhil: this checkout was unpacked without its symbolic links"
+    )
+
+
 def test_every_public_name_is_there():
     assert {name for name in starhil.__all__ if getattr(starhil, name) is None} == set()
     assert set(dir(starhil)) == set(starhil.__all__)
