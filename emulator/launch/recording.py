@@ -37,10 +37,8 @@ class _RunFile(BaseModel):
 
     folder: str
     profile: Profile
-    ends: bool = False
-    """Whether the tape of a complete run ends with the entry `end`: not if an older version recorded it."""
-    machine: dict[str, str] = {}
-    """Processor and versions of libraries, see `machine.description`; empty if an older version recorded it."""
+    machine: dict[str, str]
+    """Processor and versions of libraries, see `machine.description`."""
 
 
 def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
@@ -80,7 +78,6 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
         "machine": description(),
         "folder": str(profile.folder.resolve()),
         "profile": values,
-        "ends": True,
     }
     (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
 
@@ -98,8 +95,6 @@ class RecordedRun:
     """What is known of a recorded run beside its tape."""
 
     profile: Profile
-    ends: bool
-    """Whether its tape ends with the entry `end`."""
     machine: Mapping[str, str]
 
 
@@ -117,7 +112,7 @@ def read_run(folder: Path) -> RecordedRun:
         if table.get(key) == name:
             table[key] = str((folder / name).absolute())
     profile = Profile.model_validate(values)
-    return RecordedRun(profile.read_from(Path(run.folder) / RUN_FILE), run.ends, run.machine)
+    return RecordedRun(profile.read_from(Path(run.folder) / RUN_FILE), run.machine)
 
 
 def read_recorded(path: Path) -> str:

@@ -67,6 +67,12 @@ def _hex_bytes(text: str, _icd: InterfaceDefinition) -> bytes:
 
 
 def _raw_item(text: str, icd: InterfaceDefinition) -> bytes | CanFrame:
+    for rows, what, action in (
+        (icd.telecommands, "a telecommand", "command"),
+        (icd.telemetry, "telemetry", "read"),
+    ):
+        if text in rows:
+            raise ValueError(f"takes raw data, and {text!r} is {what}: use {action}")
     return parse_frame(text) if "#" in text else _hex_bytes(text, icd)
 
 
