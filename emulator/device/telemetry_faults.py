@@ -148,10 +148,10 @@ class Injected:
         self._held: Snapshot | None = None
         """The device at the first affected message since the fault is on."""
 
-    def affects(self, shot: Snapshot, *, counted: bool) -> bool:
+    def affects(self, snapshot: Snapshot, *, counted: bool) -> bool:
         """Return whether a message of this moment is affected; one that is not `counted` changes nothing."""
         fault = self.fault
-        on = fault.is_on(shot.now_ns - self._at_ns)
+        on = fault.is_on(snapshot.now_ns - self._at_ns)
         if not on or (fault.count is not None and self._affected >= fault.count):
             self._held = None if counted else self._held
             return False
@@ -160,17 +160,19 @@ class Injected:
         if fault.probability < 1.0 and self._random.random() >= fault.probability:
             return False
         self._affected += 1
-        if self._held is None and (fault.freeze == "all" or (shot.frame is not None and shot.frame.valid)):
-            self._held = shot
+        if self._held is None and (
+            fault.freeze == "all" or (snapshot.frame is not None and snapshot.frame.valid)
+        ):
+            self._held = snapshot
         return True
 
-    def seen(self, shot: Snapshot) -> Snapshot:
+    def seen(self, snapshot: Snapshot) -> Snapshot:
         """Return what the device believes instead of a snapshot."""
-        fault, held, frame = self.fault, self._held or shot, shot.frame
+        fault, held, frame = self.fault, self._held or snapshot, snapshot.frame
         if fault.freeze == "all":
             return held
         if frame is None:
-            return shot
+            return snapshot
         if fault.freeze == "attitude" and held.frame is not None:
             frame = _with_attitude_of(held.frame, frame)
         if fault.turn_deg is not None:
@@ -180,7 +182,7 @@ class Injected:
         stale_ns = nanoseconds(fault.stale_s)
         if stale_ns:
             frame = replace(frame, mid_ns=frame.mid_ns - stale_ns, mid_unix_ns=frame.mid_unix_ns - stale_ns)
-        return shot if frame is shot.frame else replace(shot, frame=frame)
+        return snapshot if frame is snapshot.frame else replace(snapshot, frame=frame)
 
     def _axis(self, counter: int) -> Array:
         """Return the random unit vector (3,) of an image, the same in each of its messages."""
@@ -205,7 +207,7 @@ class Injected:
             return []
         if fault.answer_with is not None:
             row, data = row_of(fault.answer_with)
-            reply = replace(reply, id=row.id, klass=row.klass, data=data)
+            reply = replace(reply, id=row.id, message_class=row.message_class, data=data)
         if fault.wrong_id is not None:
             reply = replace(reply, id=fault.wrong_id)
         if fault.truncate:
@@ -243,7 +245,9 @@ class TelemetryFaults:
             self._number += 1
             self._injected.append(Injected(fault, now_ns, f"telemetry {self._seed} {self._number}"))
 
-    def hits(self, row: Row | None, shot: Snapshot, *, counted: bool = True, packet: bool = False) -> Hits:
+    def hits(
+        self, row: Row | None, snapshot: Snapshot, *, counted: bool = True, packet: bool = False
+    ) -> Hits:
         """Return the faults that affect a message of a row at this moment, or a packet that its action sends.
 
         A message to the console, which is not `counted`, shows a fault that is on, and changes nothing for others.
@@ -253,7 +257,7 @@ class TelemetryFaults:
         return [
             each
             for each in self._injected
-            if _concerns(each.fault, row, packet=packet) and each.affects(shot, counted=counted)
+            if _concerns(each.fault, row, packet=packet) and each.affects(snapshot, counted=counted)
         ]
 
     def check(self, fault: TelemetryFault, shown: Mapping[str, frozenset[str]]) -> None:

@@ -14,7 +14,7 @@ from starhil.hil_tests.rig.rig import ControlledTruth, Rig
 from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.results import SessionResult, StepResult
 from starhil.hil_tests.session.script import Script
-from starhil.hil_tests.session.steps import Attempt, SessionState, Step, TruthOverTime
+from starhil.hil_tests.session.step import Attempt, SessionState, Step, TruthOverTime
 from starhil.protocol.errors import ProtocolError
 
 
