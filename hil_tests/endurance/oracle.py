@@ -260,8 +260,11 @@ class Oracle:
     def _arguments(self, row: Row, data: bytes) -> dict[str, Any]:
         """Return the values of a telecommand by argument, in the argument's unit, and by name for other fields."""
         found: dict[str, Any] = dict(row.arguments)
-        for name, value in row.decode(data).items():
-            field = row.named[name]
+        values = row.decode(data)
+        for name, field in row.named.items():
+            if name not in values:  # the data end early
+                continue
+            value = values[name]
             if field.argument in _CLOCK and not isinstance(value, (str, bytes)):
                 value = float(value) * (factor(field.unit, _CLOCK[field.argument]) or 1.0)
             found[field.argument or name] = value

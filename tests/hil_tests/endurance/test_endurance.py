@@ -146,7 +146,9 @@ def test_telemetry_that_comes_right_after_a_new_format_or_address_has_it(paramet
         request_on(link, change, data),
         {"do": "wait", "s": 3.0},
     )
-    outcome = run_once(Life("cubestar", 1, ("serial", "can"), {"parameters": {"start_mode": "standby"}}, steps))
+    outcome = run_once(
+        Life("cubestar", 1, ("serial", "can"), {"parameters": {"start_mode": "standby"}}, steps)
+    )
     assert outcome.violation == ""
     assert outcome.readings > 10
 
