@@ -43,7 +43,7 @@ STATUS_S: Final = 0.5
 CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "clear_faults", "scenario"})
 """Requests on the control channel that a page may make."""
 
-LOOKS: Final = frozenset({"subscribe", "encode", "parameters"})
+READ_ONLY_REQUESTS: Final = frozenset({"subscribe", "encode", "parameters"})
 """Requests that a page for viewing only may make."""
 
 
@@ -272,8 +272,10 @@ class Console:
         return [
             {
                 "link": LINKS[name].title,
-                "requests": link.heard.requests,
-                "age_s": None if link.heard.last_s is None else round(now_s - link.heard.last_s, 1),
+                "requests": link.obc_requests.requests,
+                "age_s": None
+                if link.obc_requests.last_s is None
+                else round(now_s - link.obc_requests.last_s, 1),
             }
             for name, link in self._head.links.items()
         ]
@@ -301,7 +303,7 @@ class Console:
         action = self._actions.get(str(request.get("do")))
         if action is None:
             return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
-        if not viewer.commands and request["do"] not in LOOKS:
+        if not viewer.commands and request["do"] not in READ_ONLY_REQUESTS:
             return {**identity, "ok": False, "error": "view only: the token of this page may not command"}
         try:
             return {**identity, "ok": True, **await action(viewer, request)}

@@ -24,7 +24,7 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
 from starhil.protocol.canopen.cob import SDO_RECEIVE
-from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
+from starhil.protocol.canopen.context import UNCONFIGURED_NODE, EventKind, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
@@ -74,9 +74,9 @@ def not_before(deadline: float) -> int:
 class DeviceSample:
     """The device at one moment, `starhil.protocol.canopen.application.Sample`."""
 
-    def __init__(self, requests: Requests, shot: Snapshot) -> None:
+    def __init__(self, requests: Requests, snapshot: Snapshot) -> None:
         self._requests = requests
-        self._shot = shot
+        self._shot = snapshot
 
     def telemetry(self, row: Row) -> bytes:
         """Return the bytes of a telemetry row."""
@@ -223,7 +223,7 @@ class CanopenLink(Link[CanFrame]):
     async def start(self) -> str:
         """Join the bus and send the boot-up message; return the description of the bus."""
         bus, node = await super().start(), self.slave.node_id
-        self._node.acquire(bus, 0 if node == UNCONFIGURED else node)
+        self._node.acquire(bus, 0 if node == UNCONFIGURED_NODE else node)
         self._run_action(self.slave.start)
         return bus
 
@@ -244,7 +244,7 @@ class CanopenLink(Link[CanFrame]):
     def _receive(self, item: CanFrame) -> None:
         if not item.extended and not self._device.unresponsive:
             if item.id == SDO_RECEIVE + self.slave.node_id:
-                self.heard.count()
+                self.obc_requests.count()
             self._run_action(partial(self.slave.receive, item))
 
     def _run_action(self, action: Action) -> None:
@@ -288,7 +288,6 @@ class CanopenLink(Link[CanFrame]):
         self._run_action(self.slave.tick)
 
     def _handle_event(self, event: SlaveEvent) -> None:
-        """Handle an event reported by the slave."""
         match event.kind:
             case EventKind.TIME:
                 self._device.time.set_unix_ns(round(event.value * 1000) * MILLISECOND_NS)

@@ -173,7 +173,7 @@ ALTERNATIVES: Final = (
 CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"})
 """Device parameters that describe the camera; by default, the device is calibrated exactly."""
 
-OF_CAMERA: Final = CALIBRATION | {"limiting_magnitude"}
+CAMERA_PARAMETERS: Final = CALIBRATION | {"limiting_magnitude"}
 """Device parameters that are not inherited by a profile with another camera."""
 
 PATHS: Final = profile_paths(Profile)
@@ -183,13 +183,13 @@ _LONGEST_SHOWN: Final = 200
 """Longest part of a `--set` that an error repeats before it says what is wrong with it, characters."""
 
 _A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
-OF_FAULTS: Final = dict.fromkeys(
+FAULT_KEY_HINTS: Final = dict.fromkeys(
     ("fault", "faults", "optical", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
      "delay_s", "split", "gap_s"),
     _A_FAULT,
 )  # fmt: skip
 """Keys of faults, which a profile does not have, and the hint for whoever writes one there."""
-OF_ATTITUDES: Final = {
+ATTITUDE_KEY_HINTS: Final = {
     key: f"; did you mean attitude.{key}?" for key in ("ra_deg", "dec_deg", "roll_deg", "quaternion_xyzw")
 }
 """Keys of an attitude, and the hint for whoever writes one outside its table."""
@@ -210,21 +210,23 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     if any(override.startswith("camera.") for override in overrides):
         _drop_parameters_of_camera(values)
     layers += [_apply_override(values, override) for override in overrides]
-    found: list[tuple[Sequence[object], str]] = []
+    faults: list[tuple[Sequence[object], str]] = []
     profile = None
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
-        listed = problems(error, Profile, values, also=("extends",), hints=OF_FAULTS | OF_ATTITUDES)
-        found += [(problem.location, str(problem)) for problem in listed]
+        listed = problems(
+            error, Profile, values, also=("extends",), hints=FAULT_KEY_HINTS | ATTITUDE_KEY_HINTS
+        )
+        faults += [(problem.location, str(problem)) for problem in listed]
     name = str(values.get("unit", DEFAULT_UNIT))
     unit = _path_of_unit(name, path.parent)
     if unit is None:
-        found.append((("unit",), f"unit: {not_found('unit', name)}"))
+        faults.append((("unit",), f"unit: {not_found('unit', name)}"))
     for section, check in _checks(values, unit):
-        found += _problems_of_keys(section, values.get(section), check)
-    if found or profile is None:
-        named = ((_source_of(layers, location) or f"profile {path}", text) for location, text in found)
+        faults += _problems_of_keys(section, values.get(section), check)
+    if faults or profile is None:
+        named = ((_source_of(layers, location) or f"profile {path}", text) for location, text in faults)
         raise EmulatorError(*(f"{source}: {text}" for source, text in named))
     return profile.read_from(path, layers)
 
@@ -273,9 +275,9 @@ def _problems_of_keys(
 
     The rest of a table with many problems is not checked.
     """
-    found, keys = 0, table if isinstance(table, dict) else {}
+    count, keys = 0, table if isinstance(table, dict) else {}
     for number, (key, value) in enumerate(keys.items()):
-        if found >= MAX_PROBLEMS - 1:
+        if count >= MAX_PROBLEMS - 1:
             yield (
                 (section,),
                 f"{section}: {len(keys) - number} more keys are not checked; correct these first",
@@ -285,17 +287,17 @@ def _problems_of_keys(
             check({key: value})
         except (EmulatorError, ProtocolError) as error:
             yield from (((section, key), text) for text in error.problems)
-            found += 1
+            count += 1
 
 
-def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) -> None:
+def _check_parameters(parameters: Mapping[str, Parameter], table: Mapping[str, Any]) -> None:
     for name, value in table.items():
-        if name not in known:
-            raise EmulatorError(f"parameters.{name}: unknown key{remedy(name, known)}")
-        if known[name].profile_key:
-            raise EmulatorError(f"parameters.{name}: set {known[name].profile_key} instead")
+        if name not in parameters:
+            raise EmulatorError(f"parameters.{name}: unknown key{remedy(name, parameters)}")
+        if parameters[name].profile_key:
+            raise EmulatorError(f"parameters.{name}: set {parameters[name].profile_key} instead")
         try:
-            known[name].check(value)
+            parameters[name].check(value)
         except ProtocolError as error:
             raise EmulatorError(f"parameters.{error}") from None
 
@@ -353,16 +355,18 @@ def _drop_parameters_of_camera(values: dict[str, Any]) -> None:
     values.pop("calibration", None)
     parameters = values.get("parameters")
     if isinstance(parameters, dict):
-        values["parameters"] = {key: value for key, value in parameters.items() if key not in OF_CAMERA}
+        values["parameters"] = {
+            key: value for key, value in parameters.items() if key not in CAMERA_PARAMETERS
+        }
 
 
-def _replaced_by(given: Iterable[str]) -> set[str]:
+def _replaced_by(present: Iterable[str]) -> set[str]:
     """Return the keys of a table that are excluded by the given ones."""
     return {
         key
         for forms in ALTERNATIVES
         for keys, by in permutations(forms, 2)
-        if not by.isdisjoint(given)
+        if not by.isdisjoint(present)
         for key in keys
     }
 

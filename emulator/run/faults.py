@@ -166,9 +166,7 @@ class FaultRequest(Strict):
     optical: SkyValues | None = None
     """Objects in addition to the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
     device: DeviceFault | None = None
-    """Fault of the device."""
     serial: WireFault | None = None
-    """Faults of the serial line."""
     can: WireFault | None = None
     """Faults of outgoing CAN frames, including CANopen."""
 
@@ -243,12 +241,12 @@ class Faults:
 
     def describe(self) -> dict[str, Any]:
         """Return the current faults by level."""
-        found: dict[str, Any] = {}
+        active: dict[str, Any] = {}
         if self._device.surroundings.faults:
-            found["optical"] = self._device.surroundings.faults
+            active["optical"] = self._device.surroundings.faults
         if of_device := {k: v for effect in EFFECTS.values() for k, v in effect.active(self._device).items()}:
-            found["device"] = of_device
+            active["device"] = of_device
         for name, wire in self._wires:
             if not wire.settings.none:
-                found[name] = wire.settings.model_dump()
-        return found
+                active[name] = wire.settings.model_dump()
+        return active

@@ -193,12 +193,12 @@ class Oracle:
         """Return whether a value of a telecommand is outside its limits."""
         return any(field.fault(field.read(data)) for field in row.carried(data))
 
-    def _mode_verdict(self, wanted: str) -> str | None:
+    def _mode_verdict(self, commanded: str) -> str | None:
         running = set(self._definition.modes) - {"boot", "error"}
-        votes = {wanted in _COMMANDED.get(mode, running) for mode in self.modes}
-        if votes == {False} or (wanted == "tracking" and not self._has_imaged):
+        votes = {commanded in _COMMANDABLE_MODES.get(mode, running) for mode in self.modes}
+        if votes == {False} or (commanded == "tracking" and not self._has_imaged):
             return "sequence"
-        certain = votes == {True} and wanted != "tracking" and "error" not in self.modes
+        certain = votes == {True} and commanded != "tracking" and "error" not in self.modes
         return "ok" if certain else None
 
     def _parameter_verdict(self, arguments: Mapping[str, Any]) -> str | None:
@@ -259,7 +259,7 @@ class Oracle:
 
     def _arguments(self, row: Row, data: bytes) -> dict[str, Any]:
         """Return the values of a telecommand by argument, in the argument's unit, and by name for other fields."""
-        found: dict[str, Any] = dict(row.arguments)
+        arguments: dict[str, Any] = dict(row.arguments)
         values = row.decode(data)
         for name, field in row.named.items():
             if name not in values:  # the data end early
@@ -267,8 +267,8 @@ class Oracle:
             value = values[name]
             if field.argument in _CLOCK and not isinstance(value, (str, bytes)):
                 value = float(value) * (factor(field.unit, _CLOCK[field.argument]) or 1.0)
-            found[field.argument or name] = value
-        return found
+            arguments[field.argument or name] = value
+        return arguments
 
     def _set(self, changes: Mapping[str, Known | None]) -> None:
         self.values.update(changes)
@@ -325,12 +325,12 @@ class Oracle:
             self.attitudes.judge(name, read, self.now_s, imaging=imaging)
 
     def _check_parameter(self, where: str, field: Field, value: Value, name: str) -> None:
-        known = self.values[name]
-        if known is None:
+        bounds = self.values[name]
+        if bounds is None:
             if not field.shared and not (field.kind == "enum" and not isinstance(value, str)):
                 self._set({name: (value, field.resolution)})
             return
-        expected, tolerance = known
+        expected, tolerance = bounds
         wrong = False
         if isinstance(expected, bool) or isinstance(value, bool):
             wrong = field.kind in ("flag", "integer", "bits", "enum") and bool(value) != bool(expected)
@@ -434,7 +434,7 @@ class Oracle:
             raise Violation(f"{where}: {value}, not {self._last[1]}")
 
 
-_COMMANDED: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
+_COMMANDABLE_MODES: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
 """Modes that can be commanded from a mode; from all others, any but boot and error (docs/rules.md, R13)."""
 _TIMING: Final = frozenset({"update_rate", "exposure", "delay_time"})
 _ORBIT: Final = frozenset({"orbit_semi_major_axis", "orbit_eccentricity"})

@@ -71,8 +71,10 @@ def session_of(life: Life, definition: Unit, violation: str) -> str:
             case "wait":
                 lines += ["", "[[step]]", name, f"wait_s = {min(step['s'], LONGEST_WAIT_S)}"]
             case "request" if step["link"] != "canopen":
-                klass, row_id, kind = step["row"]
-                request = Request(row_id, bytes.fromhex(step.get("data", "")), klass, kind == "telemetry")
+                message_class, row_id, kind = step["row"]
+                request = Request(
+                    row_id, bytes.fromhex(step.get("data", "")), message_class, kind == "telemetry"
+                )
                 if step["link"] == "serial":
                     sent = [SerialLine(definition).encode(request).hex(" ")]
                 else:

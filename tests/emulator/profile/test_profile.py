@@ -10,7 +10,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.profile.pipeline_setup import pipeline_setup
-from starhil.emulator.profile.profile import CALIBRATION, OF_FAULTS
+from starhil.emulator.profile.profile import CALIBRATION, FAULT_KEY_HINTS
 from starhil.emulator.run.faults import DeviceFault, FaultRequest
 from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifierSetup
 from starhil.emulator.sensor.sky.view import Sky
@@ -287,7 +287,7 @@ def test_all_errors_of_a_profile_are_listed_each_with_its_source_key_and_remedy(
 def test_the_hint_for_faults_is_given_for_every_key_of_a_fault_and_no_key_of_a_profile():
     levels = FaultRequest.model_fields.keys()
     keys = {*levels, *DeviceFault.model_fields, *WireFault.model_fields}
-    assert keys - {"device"} == OF_FAULTS.keys() - {"fault", "faults"}
+    assert keys - {"device"} == FAULT_KEY_HINTS.keys() - {"fault", "faults"}
 
 
 def test_a_profile_that_extends_itself_is_rejected(tmp_path):
