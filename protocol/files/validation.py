@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, partial
 from itertools import repeat
 from typing import Any, Final, Literal, NamedTuple, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from starhil.protocol.errors import MAX_PROBLEMS, did_you_mean, remedy
 
@@ -41,6 +42,21 @@ _UNIONS: Final = ("union_tag_invalid", "union_tag_not_found")
 
 _ERRORS_OF_ABSENT_KEYS: Final = {"missing", *_UNIONS}
 """Types of errors in a key that the document may lack."""
+
+
+@dataclass(frozen=True)
+class TableOf:
+    """Annotation of a dictionary: the keys given in a table, which is valid for a model."""
+
+    model: type[BaseModel]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Validate by the model."""
+        return core_schema.no_info_after_validator_function(
+            lambda table: table.model_dump(exclude_unset=True),
+            handler.generate_schema(self.model),
+            serialization=core_schema.plain_serializer_function_ser_schema(dict),
+        )
 
 
 class Problem(NamedTuple):
@@ -232,11 +248,14 @@ class _Key(NamedTuple):
 
 @cache
 def _keys_of(model: type[BaseModel]) -> dict[str, _Key]:
-    annotations = {field.alias or name: field.annotation for name, field in model.model_fields.items()}
-    return {
-        key: _Key(annotation, _models_in(annotation), get_origin(annotation) is dict)
-        for key, annotation in annotations.items()
-    }
+    keys = {}
+    for name, field in model.model_fields.items():
+        models = [below for item in (field.annotation, *field.metadata) for below in _models_in(item)]
+        is_mapping = get_origin(field.annotation) is dict and not any(
+            isinstance(item, TableOf) for item in field.metadata
+        )
+        keys[field.alias or name] = _Key(field.annotation, models, is_mapping)
+    return keys
 
 
 @cache
@@ -250,6 +269,8 @@ def _tags_of(model: type[BaseModel]) -> tuple[object, ...]:
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
     """Return all models in an annotation, at any depth."""
+    if isinstance(annotation, TableOf):
+        return [annotation.model]
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for inner in get_args(annotation) for model in _models_in(inner)]

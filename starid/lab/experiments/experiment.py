@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 
 from starid.catalog import StarCatalog, load_catalog
 from starid.catalog.hipparcos import EPOCH
+from starid.identification.options import Solver
 from starid.identification.thesis.database import DatabaseParameters, FeatureDatabase, build_database, sky_of
 from starid.identification.thesis.database_file import load_database, save_database
 from starid.identification.thesis.frame_sky import FrameSky
-from starid.identification.thesis.lsi import LostInSpace, Solver
+from starid.identification.thesis.lsi import LostInSpace
 from starid.lab.experiments.comparison import (
     Outcome,
     Published,
