@@ -19,6 +19,8 @@ from tests.protocol.serial.composed_links import CUBESTAR
 
 pytestmark = pytest.mark.process
 
+PATIENCE_S = 60.0
+
 ICD = load_unit()
 CHANGES_THE_DIALECT = frozenset({"reset", "restore_parameters", "default_parameters"})
 DEFAULT = str(ICD.parameters["serial_dialect"].default)
@@ -69,9 +71,9 @@ class Cosmos:
     def receive(self) -> tuple[str, Any]:
         """Return the next packet and its name."""
         try:
-            raw = self._packets.get(timeout=10.0)
+            raw = self._packets.get(timeout=PATIENCE_S)
         except Empty:
-            raise AssertionError("COSMOS received no packet within 10 s") from None
+            raise AssertionError("COSMOS received no packet in time") from None
         packet = self._telemetry.identify(raw.buffer, [self._target])
         assert packet is not None, raw.buffer
         packet.buffer = raw.buffer
@@ -154,7 +156,7 @@ def test_after_a_command_that_changes_the_dialect_cosmos_reconnects_with_the_new
             answer, packet = before.receive()
             assert (answer, packet.read("COMMAND"), packet.read("CODE")) == ("ANSWER", name.upper(), "OK")
         else:  # the device restarts
-            can_obc.wait_for("device_status", lambda reading: reading["uptime"] < up_s, within_s=20.0)
+            can_obc.wait_for("device_status", lambda reading: reading["uptime"] < up_s, within_s=PATIENCE_S)
     with connect(DEFAULT if name == "default_parameters" else stored) as after:
         after.send("REQUEST_IDENTIFICATION")
         answer, packet = after.receive()
