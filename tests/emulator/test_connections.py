@@ -82,6 +82,7 @@ async def answers(control):
         return (await control.do("status"))["ok"]
 
 
+@pytest.mark.process
 def test_half_sent_requests_on_many_connections_leave_the_control_channel_free(run, few_descriptors, caplog):
     async def scenario(emulation, _line):
         async def check():
@@ -98,6 +99,7 @@ def test_half_sent_requests_on_many_connections_leave_the_control_channel_free(r
     ]
 
 
+@pytest.mark.process
 def test_many_connections_to_the_control_channel_leave_an_open_one_and_the_console_free(
     run, few_descriptors, caplog
 ):
@@ -125,6 +127,7 @@ def test_many_connections_to_the_control_channel_leave_an_open_one_and_the_conso
     ]
 
 
+@pytest.mark.process
 def test_a_hub_rejects_clients_above_its_limit_and_serves_the_others(few_descriptors):
     async def main():
         hub = CanHub(port=0)

@@ -10,6 +10,8 @@ from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from starhil.protocol.transports.can import kernel_can_is_up
 
 FAST_BAUD = 921600
+NO_IMAGES = "run.worker=error_model"
+"""Setting of an emulator whose images do not matter: it starts in a third of the processor time."""
 
 needs_vcan0 = pytest.mark.skipif(
     not kernel_can_is_up("vcan0"),
@@ -56,7 +58,11 @@ def emulator(running_emulator):
 def sagitta(tmp_path_factory):
     """An emulated Sagitta on a pty."""
     command = emulator_command(
-        profile="ideal", unit="sagitta", seed=1, state_dir=tmp_path_factory.mktemp("sagitta")
+        profile="ideal",
+        unit="sagitta",
+        seed=1,
+        settings=[NO_IMAGES],
+        state_dir=tmp_path_factory.mktemp("sagitta"),
     )
     with EmulatorProcess(command) as process:
         yield process

@@ -247,7 +247,7 @@ def test_the_real_clock_runs_by_itself_and_ends_on_sigint(tmp_path):
 def test_a_hangup_ends_the_run_in_good_order(tmp_path):
     """SIGTERM ends that of `stepped`, SIGINT that of the real clock."""
     link = tmp_path / "tty"
-    emulator = Emulator("--symlink", str(link), "--set", "links.serial.dialect=a")
+    emulator = Emulator("--symlink", str(link), "--set", "run.worker=error_model")
     assert emulator.end(signal.SIGHUP) == (0, [])
     assert not link.is_symlink()
 

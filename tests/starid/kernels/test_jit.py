@@ -84,6 +84,7 @@ def machine_code(cache_folder: Path) -> list[Path]:
     return [path for path in cache_folder.rglob("*") if path.suffix in (".nbi", ".nbc")]
 
 
+@pytest.mark.process
 def test_a_changed_callee_in_another_module_is_detected(tmp_path: Path) -> None:
     write_package(tmp_path)
     assert run(tmp_path) == ["2.5", "0"]
@@ -144,6 +145,7 @@ def test_a_damaged_file_is_removed(cache_folder: Path, change: Callable[[bytes],
     assert (good.exists(), bad.exists()) == (True, False)
 
 
+@pytest.mark.process
 def test_a_kernel_whose_machine_code_is_damaged_is_compiled_again(tmp_path: Path, cache_folder: Path) -> None:
     write_package(tmp_path)
     assert run(tmp_path) == ["2.5", "0"]
@@ -193,6 +195,7 @@ def test_a_damaged_list_of_checksums_is_written_again(cache_folder: Path, text: 
     assert list(json.loads((folder / "checksums.json").read_text())) == ["package/new.nbc"]
 
 
+@pytest.mark.process
 def test_processes_that_start_together_on_an_empty_cache_all_get_the_result(tmp_path: Path) -> None:
     write_package(tmp_path)
     started = [process(tmp_path) for _ in range(3)]
@@ -201,6 +204,7 @@ def test_processes_that_start_together_on_an_empty_cache_all_get_the_result(tmp_
     assert run(tmp_path) == ["2.5", "1"]
 
 
+@pytest.mark.process
 def test_kernels_run_where_the_cache_cannot_be_written_and_a_line_says_so(
     tmp_path: Path, cache_folder: Path
 ) -> None:
@@ -228,6 +232,7 @@ def test_a_cache_that_can_only_be_read_is_used(
     assert (copy / "package" / "kernel.nbc").read_bytes() == b"code"
 
 
+@pytest.mark.process
 def test_the_machine_code_of_former_sources_is_evicted_beyond_the_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -241,6 +246,7 @@ def test_the_machine_code_of_former_sources_is_evicted_beyond_the_limit(
     assert new != old
 
 
+@pytest.mark.process
 def test_loaded_machine_code_counts_as_used(tmp_path: Path) -> None:
     write_package(tmp_path)
     run(tmp_path)
@@ -250,6 +256,7 @@ def test_loaded_machine_code_counts_as_used(tmp_path: Path) -> None:
     assert any(each.used_s > 1000 for each in cached_files())
 
 
+@pytest.mark.process
 def test_clearing_the_cache_removes_machine_code(tmp_path: Path) -> None:
     write_package(tmp_path)
     run(tmp_path)
