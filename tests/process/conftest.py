@@ -45,13 +45,18 @@ def running_emulator(bus, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def emulator(running_emulator):
-    """The emulator after a reset with the parameters of its profile, whatever other modules have set and saved."""
+    """The emulator after a reset with the parameters of its profile, whatever other modules have set and saved.
+
+    It ends in standby: in another mode it would render images while other modules run.
+    """
     with ObcClient.open(can=running_emulator.ready["can"], timeout_s=5.0) as client:
         for command in ("default_parameters", "save_parameters", "reset"):
             client.command(command)
         client.wait_for("device_status", lambda reading: reading["reset_cause"] == "command", within_s=60.0)
         client.wait_for("device_status", lambda reading: reading["mode"] == "standby", within_s=60.0)
-    return running_emulator
+    yield running_emulator
+    with ObcClient.open(can=running_emulator.ready["can"], timeout_s=5.0) as client:
+        client.command("set_mode", mode="standby")
 
 
 @pytest.fixture(scope="session")

@@ -33,7 +33,6 @@ def test_a_stale_symlink_can_be_locked_and_a_foreign_one_cannot(tmp_path):
         lock_symlink(foreign)
 
 
-@pytest.mark.process
 def test_a_lock_ends_with_its_process_even_when_killed(tmp_path):
     path = tmp_path / "tty"
     program = (
