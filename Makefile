@@ -52,7 +52,7 @@ test: $(VENV)/.developer
 	@tools/test_in_lanes $(BIN)/python
 
 # of `check`, beside the tests that start processes: what computes for long, and few changes touch
-LONG := $(addprefix tests/,process fuzzing conformance hil_tests/endurance emulator/benchmarks starid/lab starid/identification/thesis)
+LONG := $(addprefix tests/,process fuzzing conformance hil_tests/endurance emulator/benchmarks starid/kernels starid/lab starid/identification/thesis)
 QUICK = $(BIN)/python -m pytest -q -m "not process and not browser and not socketcan" $(LONG:%=--ignore=%)
 check: $(VENV)/.developer
 	$(BIN)/ruff check .
@@ -68,7 +68,7 @@ LOWEST_TOOLS := 'pytest>=8' 'hypothesis>=6.100' msgpack cantools canmatrix space
 # construct, jinja2; typer and rich, aiohttp, SciPy, OpenCV, pyerfa and sgp4; numpy, numba and the catalogue
 LOWEST := $(addprefix tests/protocol/,unit/test_reader.py unit/test_units.py unit/test_unit_check.py serial transports canopen export) \
 	$(addprefix tests/emulator/,cli/test_app.py console/test_server.py profile device/test_extreme_values.py sensor truth) \
-	$(addprefix tests/starid/,imaging identification/geometric camera catalog)
+	$(addprefix tests/starid/,imaging identification/geometric camera catalog kernels)
 out/lowest/.installed: pyproject.toml tools/lowest_versions.py
 	$(PYTHON) -m venv out/lowest
 	$(PYTHON) tools/lowest_versions.py >out/lowest/constraints.txt

@@ -45,6 +45,12 @@ def test_what_a_unit_on_a_serial_line_lacks_is_skipped_by_name(unit, tmp_path):
     assert "--starhil-serial names a unit, and this test needs an emulator" in out
 
 
+def test_a_link_that_is_off_has_no_tests(tmp_path):
+    out = run_pytest(tmp_path, "def test_one(starhil_can): pass\n", "--starhil-can", "off")
+    assert "SKIPPED" in out
+    assert "--starhil-can off" in out
+
+
 ISOLATED = """
 import pytest
 

@@ -43,7 +43,7 @@ async def first_frames(emulation):
         await emulation.stepper.step(FRAMES + 1.0)
     while len(emulation.shots) < FRAMES:
         await asyncio.sleep(0.01)
-    return [shot.result for shot in emulation.shots[:FRAMES]]
+    return [snapshot.result for snapshot in emulation.shots[:FRAMES]]
 
 
 def rows(results):

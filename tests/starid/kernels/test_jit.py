@@ -59,11 +59,13 @@ def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def write_package(folder: Path, *, slope: float = 2.0) -> Path:
+    """Write a package with kernels; a file that would not change stays, since numba 0.60 knows it by its time."""
     package = folder / "other_kernels"
     package.mkdir(parents=True, exist_ok=True)
-    (package / "__init__.py").write_text("")
-    (package / "outer.py").write_text(CALLER)
-    (package / "inner.py").write_text(INNER.format(slope=slope))
+    for name, text in (("__init__", ""), ("outer", CALLER), ("inner", INNER.format(slope=slope))):
+        path = package / f"{name}.py"
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)
     return folder
 
 
@@ -84,7 +86,6 @@ def machine_code(cache_folder: Path) -> list[Path]:
     return [path for path in cache_folder.rglob("*") if path.suffix in (".nbi", ".nbc")]
 
 
-@pytest.mark.process
 def test_a_changed_callee_in_another_module_is_detected(tmp_path: Path) -> None:
     write_package(tmp_path)
     assert run(tmp_path) == ["2.5", "0"]
@@ -145,7 +146,6 @@ def test_a_damaged_file_is_removed(cache_folder: Path, change: Callable[[bytes],
     assert (good.exists(), bad.exists()) == (True, False)
 
 
-@pytest.mark.process
 def test_a_kernel_whose_machine_code_is_damaged_is_compiled_again(tmp_path: Path, cache_folder: Path) -> None:
     write_package(tmp_path)
     assert run(tmp_path) == ["2.5", "0"]
@@ -195,7 +195,6 @@ def test_a_damaged_list_of_checksums_is_written_again(cache_folder: Path, text: 
     assert list(json.loads((folder / "checksums.json").read_text())) == ["package/new.nbc"]
 
 
-@pytest.mark.process
 def test_processes_that_start_together_on_an_empty_cache_all_get_the_result(tmp_path: Path) -> None:
     write_package(tmp_path)
     started = [process(tmp_path) for _ in range(3)]
@@ -204,7 +203,6 @@ def test_processes_that_start_together_on_an_empty_cache_all_get_the_result(tmp_
     assert run(tmp_path) == ["2.5", "1"]
 
 
-@pytest.mark.process
 def test_kernels_run_where_the_cache_cannot_be_written_and_a_line_says_so(
     tmp_path: Path, cache_folder: Path
 ) -> None:
@@ -232,7 +230,6 @@ def test_a_cache_that_can_only_be_read_is_used(
     assert (copy / "package" / "kernel.nbc").read_bytes() == b"code"
 
 
-@pytest.mark.process
 def test_the_machine_code_of_former_sources_is_evicted_beyond_the_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -246,7 +243,6 @@ def test_the_machine_code_of_former_sources_is_evicted_beyond_the_limit(
     assert new != old
 
 
-@pytest.mark.process
 def test_loaded_machine_code_counts_as_used(tmp_path: Path) -> None:
     write_package(tmp_path)
     run(tmp_path)
@@ -256,7 +252,6 @@ def test_loaded_machine_code_counts_as_used(tmp_path: Path) -> None:
     assert any(each.used_s > 1000 for each in cached_files())
 
 
-@pytest.mark.process
 def test_clearing_the_cache_removes_machine_code(tmp_path: Path) -> None:
     write_package(tmp_path)
     run(tmp_path)
@@ -314,6 +309,8 @@ def test_only_what_numba_publishes_is_used_and_sums_are_never_reordered() -> Non
                     modules = [each.name for each in names]
                 case ast.ImportFrom(module=str(module)):
                     modules = [module]
+                case ast.Constant(value=str(text)) if text.startswith(("numba.", "llvmlite.")):
+                    modules = [text]
                 case ast.keyword(arg="fastmath"):
                     raise AssertionError(f"{path}: fastmath reorders sums")
                 case _:
