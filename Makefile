@@ -52,7 +52,8 @@ test: $(VENV)/.developer
 	@tools/test_in_lanes $(BIN)/python
 
 # of `check`, beside the tests that start processes: what computes for long, and few changes touch
-LONG := $(addprefix tests/,process fuzzing conformance hil_tests/endurance emulator/benchmarks starid/kernels starid/lab starid/identification/thesis)
+LONG := $(addprefix tests/,process fuzzing conformance hil_tests/endurance emulator/benchmarks starid/kernels starid/lab starid/identification/thesis) \
+	$(wildcard tests/protocol/canopen/test_conformance*.py) tests/protocol/test_fuzz.py
 QUICK = $(BIN)/python -m pytest -q -m "not process and not browser and not socketcan" $(LONG:%=--ignore=%)
 check: $(VENV)/.developer
 	$(BIN)/ruff check .
