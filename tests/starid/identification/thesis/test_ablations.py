@@ -123,7 +123,7 @@ def test_shuffled_weights_of_the_lasso_double_the_error(monkeypatch):
 
     def shuffled(self, solution, features):
         weights = solution.weights[:, rng.permutation(9)]
-        places = np.radians(self.cell_centres(solution.cells))
+        places = np.radians([self.database.grid.centre(cell) for cell in solution.cells.tolist()])
         ra, dec = places.T
         directions = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
         results = solution.results.copy()
