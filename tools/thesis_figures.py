@@ -65,9 +65,9 @@ def figures(samples: list[dict[str, str]], truth: dict[str, dict[str, str]]) -> 
         * np.count_nonzero(errors <= 3600.0 * IDENTIFIED_DEG)
         / len(images),
         "median error, °": np.median(errors) / 3600.0 if len(errors) else np.nan,
-        "filter: recall, %": 100.0 * right / max(right + removed - caught, 1),
-        "filter: precision, %": 100.0 * right / max(kept, 1),
-        "false stars removed, %": 100.0 * caught / false if false else np.nan,
+        "filter: recall, %": 100.0 * right / (right + removed - caught) if kept else np.nan,
+        "filter: precision, %": 100.0 * right / kept if kept else np.nan,
+        "false stars removed, %": 100.0 * caught / false if kept and false else np.nan,
         "motion: rotation, median error, °": np.median(np.abs(turns)) if turns else np.nan,
         "motion: translation, median error, °": np.median(np.abs(shifts)) if shifts else np.nan,
         "whole database searched after the region, %": 100.0
