@@ -27,6 +27,7 @@ from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.emulator.run import Run
 from starhil.emulator.run.head import Head
 from starhil.emulator.simulation.guard import log_internal_error, one_line
+from starhil.emulator.simulation.threads import in_thread
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.errors import StaridError
@@ -42,7 +43,7 @@ STATUS_S: Final = 0.5
 CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "clear_faults", "scenario"})
 """Requests on the control channel that a page may make."""
 
-LOOKS: Final = frozenset({"subscribe", "encode", "parameters"})
+READ_ONLY_REQUESTS: Final = frozenset({"subscribe", "encode", "parameters"})
 """Requests that a page for viewing only may make."""
 
 
@@ -103,7 +104,7 @@ class Console:
         self._record_mode(device.modes.mode)
         profile = self._head.profile
         path = str(profile.folder / profile.catalog.path) if profile.catalog.path else None
-        self._stars = asyncio.create_task(asyncio.to_thread(load_bright_stars, path, profile.epoch))
+        self._stars = asyncio.create_task(in_thread(load_bright_stars, path, profile.epoch))
         loops = (self._deliver_trace, self._report_status, self._poll_telemetry)
         self._tasks = [asyncio.create_task(self._guarded(loop)) for loop in loops]
 
@@ -271,8 +272,10 @@ class Console:
         return [
             {
                 "link": LINKS[name].title,
-                "requests": link.heard.requests,
-                "age_s": None if link.heard.last_s is None else round(now_s - link.heard.last_s, 1),
+                "requests": link.obc_requests.requests,
+                "age_s": None
+                if link.obc_requests.last_s is None
+                else round(now_s - link.obc_requests.last_s, 1),
             }
             for name, link in self._head.links.items()
         ]
@@ -300,7 +303,7 @@ class Console:
         action = self._actions.get(str(request.get("do")))
         if action is None:
             return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
-        if not viewer.commands and request["do"] not in LOOKS:
+        if not viewer.commands and request["do"] not in READ_ONLY_REQUESTS:
             return {**identity, "ok": False, "error": "view only: the token of this page may not command"}
         try:
             return {**identity, "ok": True, **await action(viewer, request)}
@@ -339,7 +342,7 @@ class Console:
         mount = None if profile.truth.mount is None else profile.truth.mount.build()
         _table(request, "to")
         truth = await self._execute({"do": "truth"})
-        wanted = await asyncio.to_thread(pointing_request, request, truth, mount, path, profile.epoch)
+        wanted = await in_thread(pointing_request, request, truth, mount, path, profile.epoch)
         return await self._execute(wanted)
 
     async def _set_clock(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:

@@ -37,13 +37,14 @@ from starhil.emulator.run.tape import ClearedFaults, NewFaults
 from starhil.emulator.run.truth_log import compare
 from starhil.emulator.sensor.pipeline.messages import as_quaternion
 from starhil.emulator.simulation.guard import until_cancelled
+from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.json_lines import JsonError, parse_object, read_lines
 from starhil.emulator.truth.live import LiveTruth
 from starhil.protocol.errors import ProtocolError, did_you_mean, remedy
 from starhil.protocol.files.validation import problems
 from starhil.protocol.icd.conventions import NANOSECONDS
-from starhil.protocol.transports.connections import ConnectionLimit
+from starhil.protocol.transports.connections import ConnectionLimit, detect_lost_peer
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
@@ -51,17 +52,21 @@ log = logging.getLogger("starhil.control")
 MAX_LINE: Final = 1 << 16
 """Longest request, bytes."""
 
-EXAMINED: Final = 200
+EXAMINED_ERRORS: Final = 200
 """Number of errors of a request that are examined; of further ones the answer gives the number."""
 
 KEPT_FRAMES: Final = 200
-BUSY: Final = b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
+BUSY_ANSWER: Final = (
+    b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
+)
 
 REQUEST_S: Final = 10.0
 """Time within which a peer of the control channel or of the console must complete a request: a line, after its first
 byte; for HTTP, after it has connected or received the last response, and the body after the headers; seconds."""
 
-LATE: Final = json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
+LATE_ANSWER: Final = (
+    json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
+)
 
 Answer = dict[str, Any]
 Action = Callable[[Head, dict[str, Any]], Awaitable[Answer]]
@@ -80,8 +85,9 @@ class ControlServer:
         self._opening = asyncio.Lock()
         self._quit = quit_run
         self._server: asyncio.Server | None = None
-        self._writers: set[asyncio.StreamWriter] = set()
-        self._limit = ConnectionLimit("control channel", BUSY)
+        self._peers: dict[asyncio.StreamWriter, bool] = {}
+        """Connections, the oldest first, and whether one of their requests was accepted."""
+        self._limit = ConnectionLimit("control channel", BUSY_ANSWER)
         self._actions: dict[str, tuple[Action, tuple[str, ...] | None]] = {
             "status": (self._status, ()),
             "truth": (self._truth, ("run_time_s", "unix_s")),
@@ -124,24 +130,37 @@ class ControlServer:
             self._server.close()
         if self._socket is not None:
             self._socket.close()
-        for writer in list(self._writers):
+        for writer in list(self._peers):
             writer.transport.abort()
 
     async def _serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if not self._limit.admits(writer.transport, len(self._writers)):
+        self._make_room()
+        if not self._limit.admits(writer.transport, len(self._peers)):
             return
-        self._writers.add(writer)
+        self._peers[writer] = False
+        if self._socket is None:
+            detect_lost_peer(writer.transport, must_read=True)
         try:
             async for line in read_lines(reader, MAX_LINE, within_s=REQUEST_S):
-                writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
+                answer = await self.answer(line)
+                if writer in self._peers:
+                    self._peers[writer] |= answer["ok"]
+                writer.write(json.dumps(answer).encode() + b"\n")
                 await writer.drain()
         except ConnectionError as error:
             log.info("control channel: connection lost (%s)", error)
         except TimeoutError:
-            writer.write(LATE)
+            writer.write(LATE_ANSWER)
         finally:
-            self._writers.discard(writer)
+            self._peers.pop(writer, None)
             writer.close()
+
+    def _make_room(self) -> None:
+        """Close the oldest connection that has not shown the token, if all places are taken and there is one."""
+        stranger = next((peer for peer, accepted in self._peers.items() if not accepted), None)
+        if self._token and stranger is not None and len(self._peers) >= self._limit.size:
+            del self._peers[stranger]
+            stranger.transport.abort()
 
     async def answer(self, line: bytes | str | None) -> Answer:
         """Execute one request and return its answer; None stands for a line that was too long."""
@@ -163,26 +182,25 @@ class ControlServer:
 
     async def execute(self, request: dict[str, Any]) -> Answer:
         """Execute a decoded request, without `id` and `token`, and return its answer."""
-        wanted = str(request.pop("do", ""))
-        if wanted not in self._actions:
-            near = did_you_mean(wanted, self._actions)
+        action_name = str(request.pop("do", ""))
+        if action_name not in self._actions:
+            near = did_you_mean(action_name, self._actions)
             return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}{near}"}
-        action, known = self._actions[wanted]
+        action, keys = self._actions[action_name]
         try:
             head = self._head(request)
-            if known is not None:
-                _check_keys(request, known)
+            if keys is not None:
+                _check_keys(request, keys)
             self._run.wiring.latch()
             return {"ok": True, **await action(head, request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {"ok": False, "error": str(error)}
         except Exception as error:  # an internal error ends neither the run nor the connection
-            log.exception("control channel: %s", wanted)
+            log.exception("control channel: %s", action_name)
             name = type(error).__name__
             return {"ok": False, "error": f"internal error: {name}; see the emulator's log"}
 
     def _head(self, request: dict[str, Any]) -> Head:
-        """Return the head that a request selects."""
         number, heads = request.pop("head", 1), self._run.heads
         if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= len(heads):
             raise EmulatorError(f"head: must be 1 to {len(heads)}, not {number!r}")
@@ -281,7 +299,8 @@ class ControlServer:
         if self._run.wiring.records:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         name, start_s = str(request.get("name", "")), self._run.clock.now_ns() / NANOSECONDS
-        events = await asyncio.to_thread(lambda: load_scenario(name).prepare(head, self._run.truth, start_s))
+        async with self._opening:
+            events = await in_thread(lambda: load_scenario(name).prepare(head, self._run.truth, start_s))
         head.device.scheduler.add(events)
         return {"events": len(events)}
 
@@ -291,8 +310,6 @@ class ControlServer:
 
 
 class _Truth(BaseModel):
-    """Arguments of `set_truth`."""
-
     truth: TruthConfig
 
 
@@ -303,9 +320,9 @@ async def _parse(model: type[Model], value: object) -> Model:
         try:
             return model.model_validate_json(json.dumps(value))
         except ValidationError as error:
-            raise EmulatorError(*map(str, problems(error, model, value, most=EXAMINED))) from None
+            raise EmulatorError(*map(str, problems(error, model, value, most=EXAMINED_ERRORS))) from None
 
-    return await asyncio.to_thread(parse)
+    return await in_thread(parse)
 
 
 def _check_keys(request: dict[str, Any], known: tuple[str, ...]) -> None:

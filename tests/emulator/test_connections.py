@@ -4,6 +4,7 @@ import asyncio
 import errno
 import logging
 import resource
+import socket
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ import pytest
 from starhil.emulator.console import server
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.simulation.guard import log_loop_errors_once
+from starhil.protocol.transports import connections
 from starhil.protocol.transports.hub import CanHub
 from tests.emulator.console.pages import OPTIONS, WITHIN_S
 from tests.emulator.runs import Control
@@ -117,6 +119,50 @@ def test_many_connections_to_the_control_channel_leave_an_open_one_and_the_conso
     assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == [
         "control channel: 16 connections are open, the maximum; further ones are closed, and not logged again"
     ]
+
+
+@pytest.mark.parametrize("server_", ["console", "control channel"])
+def test_a_peer_that_does_not_read_loses_its_connection(run, monkeypatch, server_):
+    monkeypatch.setattr(connections, "UNREAD_LIMIT_MS", 300)
+
+    async def scenario(emulation, _line):
+        address = emulation.ready_fields["control"]
+        port = view_port(emulation) if server_ == "console" else int(address.rpartition(":")[2])
+        asked = {
+            "console": b"GET /static/vendor/uPlot.esm.js HTTP/1.1\r\nHost: x\r\n\r\n",
+            "control channel": b'{"do": "status"}\n',
+        }[server_]
+        with socket.socket() as peer:
+            peer.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+            peer.settimeout(0.0)
+            loop = asyncio.get_running_loop()
+            await loop.sock_connect(peer, ("127.0.0.1", port))
+
+            async def ask_without_end():
+                while True:
+                    await loop.sock_sendall(peer, asked)
+
+            with pytest.raises(ConnectionError):  # once the server has closed
+                await asyncio.wait_for(ask_without_end(), WITHIN_S)
+
+    run(scenario, options=RunOptions(control="127.0.0.1:0", console=OPTIONS.console))
+
+
+def test_with_a_token_peers_that_have_not_shown_it_leave_room_for_others(run, few_descriptors):
+    options = RunOptions(control="127.0.0.1:0", control_token="secret")
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as first:
+
+            async def check():
+                async with Control(emulation) as another:
+                    for control in (first, another):
+                        assert (await control.do("status", token="secret"))["ok"]
+
+            assert (await first.do("status", token="secret"))["ok"]
+            await flooded(int(emulation.ready_fields["control"].rpartition(":")[2]), "", check)
+
+    run(scenario, options=options)
 
 
 def test_a_hub_rejects_clients_above_its_limit_and_serves_the_others(few_descriptors):

@@ -14,7 +14,7 @@ import pytest
 
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.transports.base import TransportError
+from starhil.protocol.transports.base import TURN_S, TransportError
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.python_can import QUEUE_LIMIT, PythonCanTransport
 from tests.protocol.transports.pairs import CAN_KINDS, DEADLINE_S, FRAMES, HAS_VCAN, can_pair, until
@@ -76,6 +76,24 @@ def test_a_burst_leaves_the_loop_to_others_after_some_15_frames(kind: str) -> No
                     await asyncio.sleep(0)
                     counts.append(len(pair.got_two))
             assert max(after - before for before, after in pairwise(counts)) <= 16
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("kind", ["hub", "slcan", CAN_KINDS[-1]])
+def test_frames_that_are_much_work_leave_the_loop_to_others_one_by_one(kind: str) -> None:
+    async def main() -> None:
+        async with can_pair(kind) as pair:
+            pair.two.listener = lambda _frame: time.sleep(1.5 * TURN_S)
+            counts = [0]
+            for number in range(60):
+                pair.one.send(CanFrame(number, bytes(8), extended=False))
+            async with asyncio.timeout(DEADLINE_S):
+                while counts[-1] < 60:
+                    await asyncio.sleep(0)
+                    counts.append(len(pair.got_two))
+            assert max(after - before for before, after in pairwise(counts)) == 1
+            assert [frame.id for frame in pair.got_two] == list(range(60))
 
     asyncio.run(main())
 
