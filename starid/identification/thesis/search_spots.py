@@ -50,7 +50,7 @@ class Spots(NamedTuple):
 def _spot_of(spots: Spots, ra_deg: float, dec_deg: float) -> int:
     band = min(int((dec_deg + 90.0) / spots.height_deg), spots.band_start.size - 2)
     columns = spots.band_start[band + 1] - spots.band_start[band]
-    return spots.band_start[band] + min(int(ra_deg / 360.0 * columns), columns - 1)
+    return int(spots.band_start[band] + min(int(ra_deg / 360.0 * columns), columns - 1))
 
 
 @compiled
