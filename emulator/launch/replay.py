@@ -38,6 +38,7 @@ from starhil.emulator.run.tape import (
     LinkItem,
     NewFaults,
     NewTruth,
+    Note,
     PipelineAnswer,
     PipelineState,
     Stored,
@@ -325,6 +326,8 @@ class _Playing:
                 if not player.writes:
                     raise _DeviationError("nothing is being written")
                 player.writes.popleft()()
+            case Note():
+                pass
             case End():
                 self.ended = True
             case _:
