@@ -58,7 +58,7 @@ export class Telecommands {
       return make("label", { class: "field", title: field.doc }, make("span", { text: field.name }), control, note);
     });
     this.problem = make("p", { class: "problem" });
-    this.bytes = make("pre", { class: "bytes", id: "bytes", tabindex: "0", "aria-label": "bytes" });
+    this.bytes = make("pre", { class: "bytes", id: "bytes", tabindex: "0", role: "group", "aria-label": "bytes" });
     const send = make("button", { type: "submit", class: "primary", id: "send", title: `send ${name} (Ctrl+Enter in this form)`, text: `Send ${name}` });
     this.form.replaceChildren(make("p", { class: "dim doc" }, ...prose(row.doc)), ...fields, this.bytes, this.problem, send);
     for (const [key, item] of Object.entries(values)) if (this.form.elements[key]) this.form.elements[key].value = String(item);
