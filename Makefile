@@ -52,7 +52,7 @@ test: $(VENV)/.developer
 
 # what only tests need is of today; oem and others of the extra `test` need more than the lowest versions
 LOWEST_TOOLS := 'pytest>=8' 'hypothesis>=6.100' msgpack cantools canmatrix space_packet_parser dcf-tools durand spiceypy
-LOWEST := tests/protocol $(addprefix tests/emulator/,device links sensor/pipeline truth) $(addprefix tests/starid/,imaging identification/geometric camera catalog)
+LOWEST := tests/protocol $(addprefix tests/emulator/,device links sensor/pipeline truth) $(addprefix tests/starid/,imaging identification/geometric camera catalog kernels)
 out/lowest/.installed: pyproject.toml tools/lowest_versions.py
 	$(PYTHON) -m venv out/lowest
 	$(PYTHON) tools/lowest_versions.py >out/lowest/constraints.txt

@@ -21,7 +21,6 @@ DEFAULT_TIMEOUT_S: Final = 0.5
 """Silence within a message after which it is abandoned."""
 
 BURST_ID: Final = 119
-"""ID of the packets of a file burst."""
 
 
 class ErrorCode(IntEnum):
@@ -77,9 +76,7 @@ class FaultKind(Enum):
     UART_SHORT = "uart_short"
     """A message shorter than header and check."""
     UART_CHECK = "uart_check"
-    """A message with a wrong check."""
     UART_ADDRESS = "uart_address"
-    """A message to another address."""
     CAN_SEQUENCE = "can_sequence"
     """A segment out of order."""
     CAN_INCOMPLETE = "can_incomplete"
@@ -102,7 +99,7 @@ class Request:
     data: bytes = b""
     source: int = 0
     """Address of the sender; 0 on a serial line whose messages carry none."""
-    klass: str = ""
+    message_class: str = ""
     """Class of the row, if the unit has classes."""
     sequence: int = 0
     """Sequence number in the header, if any; the reply repeats it."""
@@ -132,7 +129,7 @@ class Reply:
     """Address of the receiver (set on the device side); 0 on a serial line whose messages carry none."""
     source: int = 0
     """Address of the sender (set on the OBC side); 0 on a serial line whose messages carry none."""
-    klass: str = ""
+    message_class: str = ""
     """Class of the row, if the unit has classes."""
     sequence: int = 0
     flags: int = 0
@@ -151,7 +148,7 @@ class Reply:
             request.id,
             request.data,
             destination=request.source,
-            klass=request.klass,
+            message_class=request.message_class,
             sequence=request.sequence,
             flags=request.flags,
         )

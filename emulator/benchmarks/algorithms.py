@@ -134,17 +134,17 @@ class Comparison:
             yield request, _without(found, scene.missing_stars, rng), number % length == 0
 
 
-def _without(found: Detections, missing: int, rng: np.random.Generator) -> Detections:
+def _without(detections: Detections, missing: int, rng: np.random.Generator) -> Detections:
     """The detections without some of the 25 brightest."""
-    brightest = np.argsort(-found.flux)[:25]
+    brightest = np.argsort(-detections.flux)[:25]
     lost = rng.choice(brightest, size=min(missing, brightest.size), replace=False)
-    kept = np.delete(np.arange(found.flux.size), lost)
+    kept = np.delete(np.arange(detections.flux.size), lost)
     columns: dict[str, Any] = {
         name: value[kept]
-        for name, value in vars(found).items()
-        if isinstance(value, np.ndarray) and value.shape[:1] == found.flux.shape
+        for name, value in vars(detections).items()
+        if isinstance(value, np.ndarray) and value.shape[:1] == detections.flux.shape
     }
-    return replace(found, **columns)
+    return replace(detections, **columns)
 
 
 class _Tally:
@@ -159,7 +159,7 @@ class _Tally:
         self._frames = self._triggers = 0
         self._bytes = 0
 
-    def add(self, request: FrameRequest, found: Detections, number: int, *, restarted: bool) -> None:
+    def add(self, request: FrameRequest, detections: Detections, number: int, *, restarted: bool) -> None:
         """Identify the detections of an image."""
         pipeline = self._device.pipeline
         identifier: Any = pipeline.identifier(request)
@@ -170,7 +170,7 @@ class _Tally:
                 identifier.reset()
         predicted = self._predicted(number)
         begin = time.thread_time()
-        solution = pipeline.solution(found, replace(request, predicted=predicted))
+        solution = pipeline.solution(detections, replace(request, predicted=predicted))
         self._ms.append(1e3 * (time.thread_time() - begin))
         self._frames += 1
         self._triggers += bool(solution.features is not None and solution.features.triggered)

@@ -323,18 +323,17 @@ async def _serve(make: Callable[[], Emulator]) -> int:
 
 def _by_format(paths: Sequence[Path]) -> dict[str, Path]:
     """Return the files of `--record` by suffix, and the folder by the empty suffix."""
-    found: dict[str, Path] = {}
+    by_suffix: dict[str, Path] = {}
     for path in paths:
         suffix = path.suffix if path.suffix in RECORDERS else ""
-        other = found.setdefault(suffix, path)
+        other = by_suffix.setdefault(suffix, path)
         if other is not path:
             kind = f"{suffix[1:].upper()} file" if suffix else "folder"
             raise EmulatorError(f"--record {path}: one {kind} per run, and {other} is one already")
-    return found
+    return by_suffix
 
 
 def _as_toml(value: str | float) -> str:
-    """Write a value as TOML."""
     if isinstance(value, (int, float)):
         return str(value)
     return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'

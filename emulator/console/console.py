@@ -49,7 +49,7 @@ CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "cl
 RUN_ID: Final = secrets.token_hex(8)
 """Tells a page that connects again whether it is still the same run."""
 
-LOOKS: Final = frozenset({"subscribe", "encode", "parameters", "message"})
+READ_ONLY_REQUESTS: Final = frozenset({"subscribe", "encode", "parameters", "message"})
 """Requests that a page for viewing only may make."""
 
 
@@ -295,8 +295,10 @@ class Console:
         return [
             {
                 "link": LINKS[name].title,
-                "requests": link.heard.requests,
-                "age_s": None if link.heard.last_s is None else round(now_s - link.heard.last_s, 1),
+                "requests": link.obc_requests.requests,
+                "age_s": None
+                if link.obc_requests.last_s is None
+                else round(now_s - link.obc_requests.last_s, 1),
             }
             for name, link in self._head.links.items()
         ]
@@ -324,7 +326,7 @@ class Console:
         action = self._actions.get(str(request.get("do")))
         if action is None:
             return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
-        if not viewer.commands and request["do"] not in LOOKS:
+        if not viewer.commands and request["do"] not in READ_ONLY_REQUESTS:
             return {**identity, "ok": False, "error": "view only: the token of this page may not command"}
         try:
             return {**identity, "ok": True, **await action(viewer, request)}

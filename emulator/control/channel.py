@@ -51,17 +51,21 @@ log = logging.getLogger("starhil.control")
 MAX_LINE: Final = 1 << 16
 """Longest request, bytes."""
 
-EXAMINED: Final = 200
+EXAMINED_ERRORS: Final = 200
 """Number of errors of a request that are examined; of further ones the answer gives the number."""
 
 KEPT_FRAMES: Final = 200
-BUSY: Final = b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
+BUSY_ANSWER: Final = (
+    b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
+)
 
 REQUEST_S: Final = 10.0
 """Time within which a peer of the control channel or of the console must complete a request: a line, after its first
 byte; for HTTP, after it has connected or received the last response, and the body after the headers; seconds."""
 
-LATE: Final = json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
+LATE_ANSWER: Final = (
+    json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
+)
 
 Answer = dict[str, Any]
 Action = Callable[[Head, dict[str, Any]], Awaitable[Answer]]
@@ -81,7 +85,7 @@ class ControlServer:
         self._quit = quit_run
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
-        self._limit = ConnectionLimit("control channel", BUSY)
+        self._limit = ConnectionLimit("control channel", BUSY_ANSWER)
         self._actions: dict[str, tuple[Action, tuple[str, ...] | None]] = {
             "status": (self._status, ()),
             "truth": (self._truth, ("run_time_s", "unix_s")),
@@ -138,7 +142,7 @@ class ControlServer:
         except ConnectionError as error:
             log.info("control channel: connection lost (%s)", error)
         except TimeoutError:
-            writer.write(LATE)
+            writer.write(LATE_ANSWER)
         finally:
             self._writers.discard(writer)
             writer.close()
@@ -163,26 +167,25 @@ class ControlServer:
 
     async def execute(self, request: dict[str, Any]) -> Answer:
         """Execute a decoded request, without `id` and `token`, and return its answer."""
-        wanted = str(request.pop("do", ""))
-        if wanted not in self._actions:
-            near = did_you_mean(wanted, self._actions)
+        action_name = str(request.pop("do", ""))
+        if action_name not in self._actions:
+            near = did_you_mean(action_name, self._actions)
             return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}{near}"}
-        action, known = self._actions[wanted]
+        action, keys = self._actions[action_name]
         try:
             head = self._head(request)
-            if known is not None:
-                _check_keys(request, known)
+            if keys is not None:
+                _check_keys(request, keys)
             self._run.wiring.latch()
             return {"ok": True, **await action(head, request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {"ok": False, "error": str(error)}
         except Exception as error:  # an internal error ends neither the run nor the connection
-            log.exception("control channel: %s", wanted)
+            log.exception("control channel: %s", action_name)
             name = type(error).__name__
             return {"ok": False, "error": f"internal error: {name}; see the emulator's log"}
 
     def _head(self, request: dict[str, Any]) -> Head:
-        """Return the head that a request selects."""
         number, heads = request.pop("head", 1), self._run.heads
         if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= len(heads):
             raise EmulatorError(f"head: must be 1 to {len(heads)}, not {number!r}")
@@ -291,8 +294,6 @@ class ControlServer:
 
 
 class _Truth(BaseModel):
-    """Arguments of `set_truth`."""
-
     truth: TruthConfig
 
 
@@ -303,7 +304,7 @@ async def _parse(model: type[Model], value: object) -> Model:
         try:
             return model.model_validate_json(json.dumps(value))
         except ValidationError as error:
-            raise EmulatorError(*map(str, problems(error, model, value, most=EXAMINED))) from None
+            raise EmulatorError(*map(str, problems(error, model, value, most=EXAMINED_ERRORS))) from None
 
     return await asyncio.to_thread(parse)
 

@@ -344,11 +344,11 @@ class Device:
             self.latest = None
         self._power_changed()
 
-    def command_mode(self, wanted: Mode) -> bool:
+    def command_mode(self, mode: Mode) -> bool:
         """Change the mode by telecommand; return False if this is refused."""
         if self.modes.mode is Mode.ERROR and not self.warm:
             return False
-        return self.modes.command(wanted, has_attitude=self.cycle.has_fix(PREDICTION_LIMIT_S))
+        return self.modes.command(mode, has_attitude=self.cycle.has_fix(PREDICTION_LIMIT_S))
 
     # --- parameters ---
 

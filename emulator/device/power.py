@@ -54,13 +54,13 @@ class PowerModel:
             return {Phase.IDLE: timing.period_s}
         left = timing.period_s
         lasting = {}
-        for phase, wanted in (
+        for phase, duration_s in (
             (Phase.EXPOSURE, timing.busy_s),
             (Phase.IMAGER_ON, self.config.imager_on_s),
             (Phase.TRANSFER, self.config.transfer_s),
             (Phase.IDLE, math.inf),
         ):
-            lasting[phase] = min(wanted, left)
+            lasting[phase] = min(duration_s, left)
             left -= lasting[phase]
         return lasting
 

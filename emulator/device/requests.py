@@ -39,9 +39,9 @@ class Requests:
             row.name: TelecommandBinding(row, icd) for row in icd.telecommands.values()
         }
         self._telemetry_rows = {
-            (row.klass, row.id): row for row in icd.telemetry.values() if not row.only_sent
+            (row.message_class, row.id): row for row in icd.telemetry.values() if not row.only_sent
         }
-        self._telecommand_rows = {(row.klass, row.id): row for row in icd.telecommands.values()}
+        self._telecommand_rows = {(row.message_class, row.id): row for row in icd.telecommands.values()}
         serial = icd.link.serial
         self._stamped = serial is not None and any(
             item.role in ("ticks", "time") for item in serial.reply_header
@@ -58,12 +58,12 @@ class Requests:
         if device.unresponsive:
             return []
         if request.kind is RequestKind.TELEMETRY:
-            row = self._telemetry_rows.get((request.klass, request.id))
+            row = self._telemetry_rows.get((request.message_class, request.id))
             if not console:
                 device.counters = device.counters.with_telemetry()
-            shot = device.snapshot()
-            return self._replies(request, row, self._answer_telemetry(request, row, shot), shot)
-        row = self._telecommand_rows.get((request.klass, request.id))
+            snapshot = device.snapshot()
+            return self._replies(request, row, self._answer_telemetry(request, row, snapshot), snapshot)
+        row = self._telecommand_rows.get((request.message_class, request.id))
         device.counters = device.counters.with_telecommand()
         outcome = self._execute(request, row)
         if isinstance(outcome, PendingAnswer):
@@ -75,9 +75,9 @@ class Requests:
             return outcome.then(acknowledge)
         code, replies = outcome
         device.signals.executed.emit(Executed(request, row, code, console))
-        shot = device.snapshot()
-        answered = self._answers_with_data(request, replies, shot, code) or self._acknowledge(
-            request, row, code, shot
+        snapshot = device.snapshot()
+        answered = self._answers_with_data(request, replies, snapshot, code) or self._acknowledge(
+            request, row, code, snapshot
         )
         following = [replace(item, destination=request.source) for item in replies if item.id is not None]
         return answered + following
@@ -88,11 +88,11 @@ class Requests:
             log.debug("%s: %s", fault.kind.value, fault.detail)
             self.device.counters = self.device.counters.with_fault(fault)
 
-    def telemetry(self, name: str, shot: Snapshot) -> bytes:
+    def telemetry(self, name: str, snapshot: Snapshot) -> bytes:
         """Return the data of a telemetry row at one moment; raises Refused if it cannot be read then."""
         binding = self.telemetry_bindings[name]
         try:
-            data = binding.encode(shot)
+            data = binding.encode(snapshot)
             binding.follow(self.device)
         except Refused:
             raise
@@ -101,11 +101,13 @@ class Requests:
             raise Refused(ErrorCode.INTERNAL) from error
         return data
 
-    def _acknowledge(self, request: Request, row: Row | None, code: ErrorCode, shot: Snapshot) -> list[Reply]:
+    def _acknowledge(
+        self, request: Request, row: Row | None, code: ErrorCode, snapshot: Snapshot
+    ) -> list[Reply]:
         """Return the answers to a telecommand that has been executed or refused."""
-        return self._replies(request, row, self._answer(request, shot, code), shot)
+        return self._replies(request, row, self._answer(request, snapshot, code), snapshot)
 
-    def _replies(self, request: Request, row: Row | None, reply: Reply, shot: Snapshot) -> list[Reply]:
+    def _replies(self, request: Request, row: Row | None, reply: Reply, snapshot: Snapshot) -> list[Reply]:
         """Return the answers of a row in order, including its reply or refusal, all of one moment."""
         if row is None or row.answers == ("reply",):
             return [reply]
@@ -118,41 +120,45 @@ class Requests:
             elif reply.kind is not ReplyKind.NACK:
                 other = self.device.icd.telemetry[answer.partition(":")[2]]
                 as_request = replace(
-                    request, kind=RequestKind.TELEMETRY, id=other.id, klass=other.klass, data=b""
+                    request,
+                    kind=RequestKind.TELEMETRY,
+                    id=other.id,
+                    message_class=other.message_class,
+                    data=b"",
                 )
-                replies.append(self._answer_telemetry(as_request, other, shot))
+                replies.append(self._answer_telemetry(as_request, other, snapshot))
         return [replace(item, final=item is replies[-1]) for item in replies]
 
     def _answers_with_data(
-        self, request: Request, replies: Sequence[Reply], shot: Snapshot, code: ErrorCode
+        self, request: Request, replies: Sequence[Reply], snapshot: Snapshot, code: ErrorCode
     ) -> list[Reply]:
         """Return answers with data made by an action of a plugin, which are marked by having no ID."""
         data = [reply.data for reply in replies if reply.id is None]
         kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
         return [
-            replace(self._reply(request, shot, kind, item, code), final=number == len(data))
+            replace(self._reply(request, snapshot, kind, item, code), final=number == len(data))
             for number, item in enumerate(data, 1)
         ]
 
-    def _answer_telemetry(self, request: Request, row: Row | None, shot: Snapshot) -> Reply:
+    def _answer_telemetry(self, request: Request, row: Row | None, snapshot: Snapshot) -> Reply:
         if row is None:
-            return self._answer(request, shot, ErrorCode.INVALID_ID)
+            return self._answer(request, snapshot, ErrorCode.INVALID_ID)
         if request.data:
-            return self._answer(request, shot, ErrorCode.INVALID_LENGTH)
+            return self._answer(request, snapshot, ErrorCode.INVALID_LENGTH)
         try:
-            data = self.telemetry(row.name, shot)
+            data = self.telemetry(row.name, snapshot)
         except Refused as refused:
-            return self._answer(request, shot, refused.code)
-        return self._reply(request, shot, ReplyKind.TELEMETRY, data)
+            return self._answer(request, snapshot, refused.code)
+        return self._reply(request, snapshot, ReplyKind.TELEMETRY, data)
 
-    def _answer(self, request: Request, shot: Snapshot, code: ErrorCode) -> Reply:
+    def _answer(self, request: Request, snapshot: Snapshot, code: ErrorCode) -> Reply:
         kind = ReplyKind.ACK if code is ErrorCode.OK else ReplyKind.NACK
-        return self._reply(request, shot, kind, code=code)
+        return self._reply(request, snapshot, kind, code=code)
 
     def _reply(
         self,
         request: Request,
-        shot: Snapshot,
+        snapshot: Snapshot,
         kind: ReplyKind,
         data: bytes = b"",
         code: ErrorCode = ErrorCode.OK,
@@ -163,15 +169,19 @@ class Requests:
             data,
             code,
             request.source,
-            klass=request.klass,
+            message_class=request.message_class,
             sequence=request.sequence,
             flags=request.flags,
         )
-        return self._with_times(reply, shot)
+        return self._with_times(reply, snapshot)
 
-    def _with_times(self, reply: Reply, shot: Snapshot) -> Reply:
+    def _with_times(self, reply: Reply, snapshot: Snapshot) -> Reply:
         """Return a reply with uptime and device time since the unit's epoch, if replies of the unit carry them."""
-        return replace(reply, uptime_ns=shot.uptime_ns, time_ns=shot.clock_ns) if self._stamped else reply
+        return (
+            replace(reply, uptime_ns=snapshot.uptime_ns, time_ns=snapshot.clock_ns)
+            if self._stamped
+            else reply
+        )
 
     def _execute(
         self, request: Request, row: Row | None
@@ -216,13 +226,15 @@ class Requests:
         if device.unresponsive or not rows:
             return
         host = int(device.parameters["host_address"])
-        shot = device.snapshot()
+        snapshot = device.snapshot()
         for row in rows:
             try:
-                data = self.telemetry(row.name, shot)
+                data = self.telemetry(row.name, snapshot)
             except Refused:  # the row cannot be read now, for example while an image is being opened
                 continue
-            reply = Reply(ReplyKind.UNSOLICITED, row.id, data, destination=host, klass=row.klass)
-            device.signals.unsolicited.emit(self._with_times(reply, shot))
+            reply = Reply(
+                ReplyKind.UNSOLICITED, row.id, data, destination=host, message_class=row.message_class
+            )
+            device.signals.unsolicited.emit(self._with_times(reply, snapshot))
             if row.action is not None:
-                shot = device.snapshot()  # after the action that follows the reading of the row
+                snapshot = device.snapshot()  # after the action that follows the reading of the row

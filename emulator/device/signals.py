@@ -13,8 +13,8 @@ Two parts that do not depend on the device have signals elsewhere: `Scheduler.ad
 `SensorPipeline.ended` starts the pipeline again.
 
 The sender changes its own state before it reports. Observers are called in any order, except those that connect as
-`first`: the device, so that every other part finds it up to date, and the numbers of messages, which begin before the
-rows that report a start.
+`first`: the device, so that every other part finds it up to date, and the message numbers of the serial link, which
+restart before the rows that report a start are sent.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a user asks for around a run: logs, recording, scenario, control channel and console."""
+"""What a user can add to a run: logs, recording, scenario, control channel and console."""
 
 from __future__ import annotations
 
@@ -30,7 +30,6 @@ class ConsoleOptions:
     """Options of console and recorders, which use images and have an OBC on the bus of each head."""
 
     make_client: MakeClient
-    """Makes the OBC."""
     view: str = "off"
     """Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT."""
     view_token: str = ""
@@ -230,14 +229,14 @@ def path_of_head(path: Path, number: int) -> Path:
 def with_own_seeds(profiles: Sequence[Profile]) -> list[Profile]:
     """Return the profiles with distinct seeds: a seed that an earlier head has is increased until unused."""
     seeds: set[int] = set()
-    found: list[Profile] = []
+    seeded: list[Profile] = []
     for profile in profiles:
         seed = profile.run.seed
         while seed in seeds:
             seed += 1
         seeds.add(seed)
-        found.append(profile.model_copy(update={"run": profile.run.model_copy(update={"seed": seed})}))
-    return found
+        seeded.append(profile.model_copy(update={"run": profile.run.model_copy(update={"seed": seed})}))
+    return seeded
 
 
 def check_heads(profiles: Sequence[Profile]) -> None:

@@ -245,7 +245,7 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
             if pipeline is None:
                 raise EmulatorError("replay: the run has no pipeline")
             play = _Playing(again, head, player, pipeline, await head.imager.start())
-            recording = await play.entries(folder, report, ends=recording_of.ends)
+            recording = await play.entries(folder, report)
             to_the_end = not report.differences
             new_decoder = partial(Decoder, head.icd, head.serial_dialect)
             for link in sorted({each.bus for each in recording} | set(player.receivers)):
@@ -266,8 +266,6 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
 
 
 class _Playing:
-    """Plays entries one by one."""
-
     def __init__(
         self, run: Run, head: Head, player: Player, pipeline: PlayedPipeline, warm: PipelineReady
     ) -> None:
@@ -279,7 +277,7 @@ class _Playing:
         self.ended = False
         """Whether the entry `end` was played."""
 
-    async def entries(self, folder: Path, report: ReplayReport, *, ends: bool) -> list[WireItem]:
+    async def entries(self, folder: Path, report: ReplayReport) -> list[WireItem]:
         """Play a tape to its end, or to the entry at which the device deviates; return what passed the links until there."""
         recording: list[WireItem] = []
         stepped = self.player.stepped
@@ -299,7 +297,7 @@ class _Playing:
             except (EmulatorError, ProtocolError, StaridError) as error:
                 raise EmulatorError(f"replay {where}: {error}") from None
             report.entries += not self.ended
-        if ends and not self.ended:
+        if not self.ended:
             report.differences.append(
                 f"{folder / EVENTS_FILE}: truncated at {stepped.now_ns() / NANOSECONDS:.6f} s: the run was killed, or lines are missing"
             )

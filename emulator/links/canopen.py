@@ -24,7 +24,7 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
 from starhil.protocol.canopen.cob import SDO_RECEIVE
-from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
+from starhil.protocol.canopen.context import UNCONFIGURED_NODE, EventKind, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
@@ -74,9 +74,9 @@ def not_before(deadline: float) -> int:
 class DeviceSample:
     """The device at one moment, `starhil.protocol.canopen.application.Sample`."""
 
-    def __init__(self, requests: Requests, shot: Snapshot) -> None:
+    def __init__(self, requests: Requests, snapshot: Snapshot) -> None:
         self._requests = requests
-        self._shot = shot
+        self._shot = snapshot
 
     def telemetry(self, row: Row) -> bytes:
         """Return the bytes of a telemetry row."""
@@ -223,7 +223,7 @@ class CanopenLink(Link[CanFrame]):
     async def start(self) -> str:
         """Join the bus and send the boot-up message; return the description of the bus."""
         bus, node = await super().start(), self.slave.node_id
-        self._node.acquire(bus, 0 if node == UNCONFIGURED else node)
+        self._node.acquire(bus, 0 if node == UNCONFIGURED_NODE else node)
         self._run_action(self.slave.start)
         return bus
 
@@ -244,11 +244,12 @@ class CanopenLink(Link[CanFrame]):
     def _receive(self, item: CanFrame) -> None:
         if not item.extended and not self._device.unresponsive:
             if item.id == SDO_RECEIVE + self.slave.node_id:
-                self.heard.count()
+                self.obc_requests.count()
             self._run_action(partial(self.slave.receive, item))
 
     def _run_action(self, action: Action) -> None:
         """Run an action of the slave, send its frames and handle its events; nested actions run after it."""
+        # an event of the slave may cause another action, whose frames must not overtake those of this one
         self._actions.append(action)
         if self._busy:
             return
@@ -282,13 +283,13 @@ class CanopenLink(Link[CanFrame]):
         reconnects = self.transport.statistics.reconnects
         if reconnects != self._reconnects:
             self._reconnects = reconnects
+            # the error is over when it can be reported: the node is on the bus again
             code = EmergencyCode.BUS_OFF_RECOVERED
             self._run_action(partial(self.slave.raise_emergency, code, ErrorRegister.COMMUNICATION))
             self._run_action(partial(self.slave.clear_emergency, code))
         self._run_action(self.slave.tick)
 
     def _handle_event(self, event: SlaveEvent) -> None:
-        """Handle an event reported by the slave."""
         match event.kind:
             case EventKind.TIME:
                 self._device.time.set_unix_ns(round(event.value * 1000) * MILLISECOND_NS)
@@ -333,6 +334,7 @@ class CanopenLink(Link[CanFrame]):
         self._notify_rows(self._status_rows)
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
+        # a node ID that the OBC sets replaces one that was stored by LSS
         if "canopen_node" in names and self._wanted_node != self.slave.node_id:
             try:
                 self.slave.store.clear_lss()

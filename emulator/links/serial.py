@@ -71,7 +71,7 @@ class SerialLink(RequestLink[bytes, SerialStyle]):
     def _restart_numbers(self, _cause: str) -> None:
         self._numbered = 0
 
-    def _is_console(self, request: Request) -> bool:  # noqa: ARG002 (nobody else is on its line)
+    def _is_console(self, request: Request) -> bool:  # noqa: ARG002 -- a serial line has only one peer
         return self._console
 
     def _new_receiver(self) -> Receiver[bytes, Request]:

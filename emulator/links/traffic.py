@@ -1,4 +1,4 @@
-"""The traffic on the links of a head: reported as it passes, and decoded for people."""
+"""The traffic on the links of a head: reported as it passes, and decoded for display."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ class Decoder:
 
     def row_of(self, message: Request | Reply) -> Row | None:
         """Return the row of a message by class and ID, or by ID alone if it has no class."""
-        return None if message.id is None else self._icd.row(message.id, message.klass)
+        return None if message.id is None else self._icd.row(message.id, message.message_class)
 
     def _text(self, event: Request | Reply | LinkFault) -> tuple[str, str]:
         if isinstance(event, LinkFault):

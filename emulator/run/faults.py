@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.parameters import memory_bits
@@ -14,23 +14,11 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import AnyLink
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.sensor.pipeline.messages import DIRECTION_BITS, CatalogUpset
-from starhil.emulator.sensor.sky.objects import SkyObjects
+from starhil.emulator.sensor.sky.tables import OPTICAL_FAULT
 from starhil.emulator.simulation.config_model import Strict
 from starhil.protocol.errors import did_you_mean, remedy
+from starhil.protocol.files.validation import TableOf
 from starhil.protocol.icd import InterfaceDefinition
-
-
-def check_sky(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values if they are valid fields of `SkyObjects`; ValueError names the field and the allowed values."""
-    try:
-        SkyObjects.from_dict(values)
-    except EmulatorError as error:
-        raise ValueError(str(error)) from None
-    return values
-
-
-SkyValues = Annotated[dict[str, Any], AfterValidator(check_sky)]
-"""Fields of `SkyObjects` as decoded from TOML or JSON."""
 
 NO_ERROR: Final = 0
 """Value in `device_error` that means no error."""
@@ -163,12 +151,10 @@ EFFECTS: Final[Mapping[str, Effect]] = {
 class FaultRequest(Strict):
     """One `fault` request; omitted levels keep their faults."""
 
-    optical: SkyValues | None = None
+    optical: Annotated[dict[str, Any], TableOf(OPTICAL_FAULT)] | None = None
     """Objects in addition to the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
     device: DeviceFault | None = None
-    """Fault of the device."""
     serial: WireFault | None = None
-    """Faults of the serial line."""
     can: WireFault | None = None
     """Faults of outgoing CAN frames, including CANopen."""
 
@@ -243,12 +229,12 @@ class Faults:
 
     def describe(self) -> dict[str, Any]:
         """Return the current faults by level."""
-        found: dict[str, Any] = {}
+        active: dict[str, Any] = {}
         if self._device.surroundings.faults:
-            found["optical"] = self._device.surroundings.faults
+            active["optical"] = self._device.surroundings.faults
         if of_device := {k: v for effect in EFFECTS.values() for k, v in effect.active(self._device).items()}:
-            found["device"] = of_device
+            active["device"] = of_device
         for name, wire in self._wires:
             if not wire.settings.none:
-                found[name] = wire.settings.model_dump()
-        return found
+                active[name] = wire.settings.model_dump()
+        return active

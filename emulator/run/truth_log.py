@@ -113,19 +113,19 @@ def compare(measurement: Measurement) -> dict[str, Any]:
             "rms_px": result.rms_px,
         }
     if result.features is not None:
-        known = result.features
+        features = result.features
         row |= {
-            "search": known.search,
-            "triggered": known.triggered,
-            "error_psi": None if math.isnan(known.error_psi) else known.error_psi,
-            "cell": known.cell,
-            "weights": known.weights,
-            "region_deg": known.region_deg,
-            "stars_used": known.stars,
-            "stars_removed": known.removed,
-            "motion_rotation_deg": known.rotation_deg,
-            "motion_translation_deg": known.translation_deg,
-            "refined": known.refined,
+            "search": features.search,
+            "triggered": features.triggered,
+            "error_psi": None if math.isnan(features.error_psi) else features.error_psi,
+            "cell": features.cell,
+            "weights": features.weights,
+            "region_deg": features.region_deg,
+            "stars_used": features.stars,
+            "stars_removed": features.removed,
+            "motion_rotation_deg": features.rotation_deg,
+            "motion_translation_deg": features.translation_deg,
+            "refined": features.refined,
         }
     return {name: row.get(name) for name in COLUMNS}
 

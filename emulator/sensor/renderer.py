@@ -197,11 +197,11 @@ class Renderer:
         mean = self._mean_without_stars(exposure, temperature, area)
         self._pattern.telegraph.add(mean, index, exposure * sensor.dark_factor(temperature))
         planets = () if others is None else others.planets
-        path, chosen, inside = self._paths(optical_axis, rate, exposure, observer, planets)
-        count = int(np.count_nonzero(chosen < len(self._rows)))
-        magnitudes = [planets[number - len(self._rows)].magnitude for number in chosen[count:]]
+        path, sources, inside = self._paths(optical_axis, rate, exposure, observer, planets)
+        count = int(np.count_nonzero(sources < len(self._rows)))
+        magnitudes = [planets[number - len(self._rows)].magnitude for number in sources[count:]]
         planets_e = [self.sensor.electrons(magnitude, exposure) for magnitude in magnitudes]
-        electrons = np.concatenate([self._flux_e_s[chosen[:count]] * exposure, planets_e])
+        electrons = np.concatenate([self._flux_e_s[sources[:count]] * exposure, planets_e])
         drawn, centred = electrons, np.flatnonzero(inside[:count])
         object_truth = None
         if others is not None:
@@ -211,7 +211,7 @@ class Renderer:
                 drawn *= area.seen_at(path[:, :2])
             planet_xy = np.full((len(planets), 2), np.nan)
             shown = count + np.flatnonzero(inside[count:])
-            planet_xy[chosen[shown] - len(self._rows)] = path[shown, :2]
+            planet_xy[sources[shown] - len(self._rows)] = path[shown, :2]
             rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
             false_xy = self._add_false_stars(mean, others, rng, exposure)
             particles = int(rng.poisson(others.cosmic_rays_s * exposure))
@@ -219,7 +219,7 @@ class Renderer:
             object_truth = ObjectTruth(false_xy, planet_xy, tracks, area.covered_share if area else 0.0)
         self._add_light(mean, path, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
-        rows = self._rows[chosen[centred]]
+        rows = self._rows[sources[centred]]
         stars = StarTruth(
             self.catalog.hip[rows],
             rows.astype(np.int64),

@@ -180,5 +180,4 @@ def seen_from(mount: Attitude | None, body: TruthState) -> TruthState:
 
 
 def _address(config: FeedConfig) -> str:
-    """Return the address of a feed as configured."""
     return f"{'udp' if config.socket == 'udp' else 'tcp'}:{config.host}:{config.port}"

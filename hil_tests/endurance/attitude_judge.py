@@ -261,14 +261,14 @@ def _window_of(period: float) -> float:
 
 def _stars(read: Readings) -> list[tuple[Vector, Vector, float]]:
     """Return the stars of a row: measured direction, catalogue direction, and the resolution of both."""
-    found: list[tuple[Vector, Vector, float]] = []
+    stars: list[tuple[Vector, Vector, float]] = []
     while True:
-        names = [f"stars[{len(found) + 1}].{kind}_{axis}" for kind in ("vector", "icrs") for axis in "xyz"]
+        names = [f"stars[{len(stars) + 1}].{kind}_{axis}" for kind in ("vector", "icrs") for axis in "xyz"]
         items = [read[name] for name in names if name in read]
         numbers = [float(value) for _, value in items if not isinstance(value, (str, bytes))]
         if len(numbers) < 6 or not any(numbers):
-            return found
-        found.append(
+            return stars
+        stars.append(
             (
                 (numbers[0], numbers[1], numbers[2]),
                 (numbers[3], numbers[4], numbers[5]),

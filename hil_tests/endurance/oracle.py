@@ -94,7 +94,7 @@ class Oracle:
         self.restarted(0.0)
 
     def restarted(self, at_s: float) -> None:
-        """The unit has started at a time: at power-on, or again by itself."""
+        """The unit has started at a time: at power-on, or by a restart of its own."""
         self._started_s: float | None = at_s
         self.values.update({**self._defaults, **self._stored})
         self._at_start = {name: self.values[name] for name in AT_START}
@@ -125,22 +125,22 @@ class Oracle:
         self._has_imaged = self._has_imaged or bool(self.modes & IMAGING)
 
     def moved(self, motion: Motion) -> None:
-        """The truth was replaced, now."""
+        """The truth has been replaced."""
         self.attitudes.motions.append(motion)
 
     def failed(self) -> None:
-        """The unit must be in the error mode, now, by a fault or because its image pipeline has ended."""
+        """The unit must now be in the error mode, because of a fault or because its image pipeline has ended."""
         self.modes = {"error"}
 
     def covered(self, *, fully: bool) -> None:
-        """The lens was covered, now, or is not fully covered any more."""
+        """The lens has been covered, or is no longer fully covered."""
         if not fully:
             self.attitudes.dark_since_s = None
         elif self.attitudes.dark_since_s is None:
             self.attitudes.dark_since_s = self.now_s
 
     def forget(self) -> None:
-        """Nothing is known of parameters and counters any more, because a request had an unknown outcome."""
+        """Parameters and counters are unknown from now on, because a request had an unknown outcome."""
         self.values.update(dict.fromkeys(self.values))
         self._at_start = dict.fromkeys(AT_START)
         self._stored = dict.fromkeys(self.values)
@@ -193,12 +193,12 @@ class Oracle:
         """Return whether a value of a telecommand is outside its limits."""
         return any(field.fault(field.read(data)) for field in row.named.values())
 
-    def _mode_verdict(self, wanted: str) -> str | None:
+    def _mode_verdict(self, commanded: str) -> str | None:
         running = set(self._definition.modes) - {"boot", "error"}
-        votes = {wanted in _COMMANDED.get(mode, running) for mode in self.modes}
-        if votes == {False} or (wanted == "tracking" and not self._has_imaged):
+        votes = {commanded in _COMMANDABLE_MODES.get(mode, running) for mode in self.modes}
+        if votes == {False} or (commanded == "tracking" and not self._has_imaged):
             return "sequence"
-        certain = votes == {True} and wanted != "tracking" and "error" not in self.modes
+        certain = votes == {True} and commanded != "tracking" and "error" not in self.modes
         return "ok" if certain else None
 
     def _parameter_verdict(self, arguments: Mapping[str, Any]) -> str | None:
@@ -259,14 +259,14 @@ class Oracle:
 
     def _arguments(self, row: Row, data: bytes) -> dict[str, Any]:
         """Return the values of a telecommand by argument, in the argument's unit, and by name for other fields."""
-        found: dict[str, Any] = dict(row.arguments)
+        arguments: dict[str, Any] = dict(row.arguments)
         values = row.decode(data)
         for name, field in row.named.items():
             value = values[name]
             if field.argument in _CLOCK and not isinstance(value, (str, bytes)):
                 value = float(value) * (factor(field.unit, _CLOCK[field.argument]) or 1.0)
-            found[field.argument or name] = value
-        return found
+            arguments[field.argument or name] = value
+        return arguments
 
     def _set(self, changes: Mapping[str, Known | None]) -> None:
         self.values.update(changes)
@@ -323,12 +323,12 @@ class Oracle:
             self.attitudes.judge(name, read, self.now_s, imaging=imaging)
 
     def _check_parameter(self, where: str, field: Field, value: Value, name: str) -> None:
-        known = self.values[name]
-        if known is None:
+        bounds = self.values[name]
+        if bounds is None:
             if not field.shared and not (field.kind == "enum" and not isinstance(value, str)):
                 self._set({name: (value, field.resolution)})
             return
-        expected, tolerance = known
+        expected, tolerance = bounds
         wrong = False
         if isinstance(expected, bool) or isinstance(value, bool):
             wrong = field.kind in ("flag", "integer", "bits", "enum") and bool(value) != bool(expected)
@@ -432,7 +432,7 @@ class Oracle:
             raise Violation(f"{where}: {value}, not {self._last[1]}")
 
 
-_COMMANDED: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
+_COMMANDABLE_MODES: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
 """Modes that can be commanded from a mode; from all others, any but boot and error (docs/rules.md, R13)."""
 _TIMING: Final = frozenset({"update_rate", "exposure", "delay_time"})
 _ORBIT: Final = frozenset({"orbit_semi_major_axis", "orbit_eccentricity"})

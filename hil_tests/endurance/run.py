@@ -158,7 +158,9 @@ class LifeRun:
             if row.action == "set_mode":
                 fields = [field for field in row.named.values() if field.argument == "mode"]
                 data = row.encode({fields[0].name: "lost_in_space"})
-                await self._obc.request(self._unit.links[0], (row.klass, row.id, row.kind), data.hex())
+                await self._obc.request(
+                    self._unit.links[0], (row.message_class, row.id, row.kind), data.hex()
+                )
                 break
         await self._obc.pass_time(RECOVERY_S)
         for row in self._definition.readable.values():

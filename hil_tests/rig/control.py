@@ -98,11 +98,11 @@ def _connected(address: str) -> socket.socket:
         parts = urlsplit(f"//{address}")
         return socket.create_connection((parts.hostname, parts.port), ANSWER_WITHIN_S)
     with ExitStack() as stack:
-        found = stack.enter_context(socket.socket(socket.AF_UNIX))
-        found.settimeout(ANSWER_WITHIN_S)
-        found.connect(path)
+        connection = stack.enter_context(socket.socket(socket.AF_UNIX))
+        connection.settimeout(ANSWER_WITHIN_S)
+        connection.connect(path)
         stack.pop_all()
-    return found
+    return connection
 
 
 class Truth:

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.client.async_client import DEFAULT_TIMEOUT_S
@@ -20,6 +20,24 @@ from starhil.hil_tests.rig.control import ControlClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess
 from starhil.protocol.can.frame import bus_name
 from starhil.protocol.icd import InterfaceDefinition
+
+OFF: Final = "off"
+"""A link that is not used, in options of all commands."""
+
+
+def links_to_use(
+    serial: str | None, can: str | None, by_default: tuple[str | None, str | None] = (None, None)
+) -> tuple[str | None, str | None]:
+    """Return serial port and CAN channel to use, None for a link that is not: `OFF`, or not named beside one that is.
+
+    `by_default` holds for links of which nothing is said, if none is named.
+    """
+    if {serial, can} <= {None, OFF}:
+        serial, can = (
+            default if named is None else named
+            for named, default in zip((serial, can), by_default, strict=True)
+        )
+    return None if serial == OFF else serial, None if can == OFF else can
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from starhil.hil_tests.rig.rig import Rig
 from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.results import SessionResult, StepResult
 from starhil.hil_tests.session.script import Script
-from starhil.hil_tests.session.steps import Attempt, SessionState, Step
+from starhil.hil_tests.session.step import Attempt, SessionState, Step
 from starhil.protocol.errors import ProtocolError
 
 

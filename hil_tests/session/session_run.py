@@ -13,13 +13,12 @@ from rich.console import Console
 from rich.text import Text
 
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError
-from starhil.hil_tests.judge.links import BUSES
 from starhil.hil_tests.reports import FAILED, PASSED, SKIPPED, prepare_report, write_junit
 from starhil.hil_tests.rig.console_feed import RunFeed, console_address
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, pointed
 from starhil.hil_tests.rig.interruption import Interrupted
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
-from starhil.hil_tests.rig.rig import LinkOptions, Rig
+from starhil.hil_tests.rig.rig import LinkOptions, Rig, links_to_use
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
 from starhil.hil_tests.session.results import SessionResult, StepResult, junit_cases
 from starhil.hil_tests.session.script import Script, load_script
@@ -180,13 +179,15 @@ def _shown_on_console(
 
 
 def _options(request: SessionRequest, script: Script) -> LinkOptions:
-    options = request.options
-    if options.serial is None and options.can is None:
-        if not request.start:
-            raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
-        wanted = script.defaults.link or "serial"
-        serial, can = ("auto" if wanted in (link, "both") else None for link in BUSES)
-        options = replace(options, serial=serial, can=can)
+    wanted = (script.defaults.link or "serial") if request.start else None
+    by_default = (
+        "auto" if wanted in ("serial", "both") else None,
+        "auto" if wanted in ("can", "both") else None,
+    )
+    serial, can = links_to_use(request.options.serial, request.options.can, by_default)
+    if serial is None and can is None:
+        raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
+    options = replace(request.options, serial=serial, can=can)
     if not request.start and options.serial == "auto":
         raise BenchError("--serial auto needs --start; otherwise name the port")
     return replace(options, timeout_s=script.defaults.timeout_s, retries=script.defaults.retries)
@@ -196,8 +197,8 @@ def _emulator(
     request: SessionRequest, script: Script, options: LinkOptions, folder: Path, state: Path
 ) -> EmulatorProcess:
     """Prepare an emulator for the session, with an empty parameter store."""
-    wanted = script.emulator
-    beside = find_script(request.script).parent / (wanted.profile or "")
+    section = script.emulator
+    beside = find_script(request.script).parent / (section.profile or "")
     truth_log = None
     if script.truth.file is not None and request.truth is None:
         truth_log = folder / script.truth.file
@@ -205,13 +206,13 @@ def _emulator(
     extra += ["--control", "auto"] if any(isinstance(step, Control) for step in script.steps) else []
     return EmulatorProcess(
         emulator_command(
-            profile=request.profile or (str(beside) if beside.is_file() else wanted.profile),
+            profile=request.profile or (str(beside) if beside.is_file() else section.profile),
             unit=request.unit,
             serial=options.serial or "off",
             can=options.can or "off",
             dialect=options.dialect,
-            seed=wanted.seed,
-            settings=pointed(script.truth.attitude, wanted.settings),
+            seed=section.seed,
+            settings=pointed(script.truth.attitude, section.settings),
             state_dir=state,
             truth_log=truth_log,
             extra=extra,

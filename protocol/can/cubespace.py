@@ -56,9 +56,7 @@ class MessageType(IntEnum):
     TELEMETRY = 5
     TELEMETRY_NACK = 6
     TELECOMMAND_EXTENDED = 7
-    """A segment of a telecommand."""
     TELEMETRY_EXTENDED = 8
-    """A segment of a telemetry reply."""
     EVENT = 9
     UNSOLICITED_FIRST = 10
     UNSOLICITED_BODY = 11
@@ -184,9 +182,7 @@ class _Assembly:
     """A segmented message that is incomplete."""
 
     first: int
-    """Counter of the first segment."""
     left: int
-    """Remaining segments."""
     time: float
     """Time at which the last segment arrived, s."""
     data: bytearray

@@ -156,7 +156,7 @@ class HubTransport(ReconnectingTransport[CanFrame]):
 
 
 class AutoHubTransport(HubTransport):
-    """Joins the hub at an address, and starts it in this process whenever nobody listens there.
+    """Joins the hub at an address, and starts it in this process if there is none.
 
     Port 0 starts a new hub at a free port.
     """

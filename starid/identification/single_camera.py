@@ -66,12 +66,12 @@ def checked_detections(
         raise StaridError(f"detections: every position must lie within ±{FARTHEST_PX:g} pixels")
     sigmas = np.ones(xy.shape)
     if xy_sigma_px is not None:
-        given = _numbers(xy_sigma_px, "position errors")
-        if given.shape not in {(len(xy),), xy.shape}:
+        errors = _numbers(xy_sigma_px, "position errors")
+        if errors.shape not in {(len(xy),), xy.shape}:
             raise StaridError(
-                f"detections: shape of the errors of {len(xy)} positions must be (n,) or (n, 2), not {given.shape}"
+                f"detections: shape of the errors of {len(xy)} positions must be (n,) or (n, 2), not {errors.shape}"
             )
-        sigmas[:] = given if given.ndim == 2 else given[:, None]
+        sigmas[:] = errors if errors.ndim == 2 else errors[:, None]
         if not (np.isfinite(sigmas).all() and (sigmas > 0.0).all()):
             raise StaridError("detections: every position error must be finite and positive")
     return xy, brightness, sigmas

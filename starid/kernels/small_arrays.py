@@ -1,4 +1,4 @@
-"""What kernels do with small arrays where the form that numpy has for it takes seconds to compile."""
+"""Operations on small arrays for kernels, in place of numpy functions that take seconds to compile."""
 
 from __future__ import annotations
 

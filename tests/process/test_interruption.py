@@ -23,14 +23,11 @@ SESSION = "[[step]]\nread = 'identification'\n[[step]]\nwait_s = 600\n[[step]]\n
 
 
 @pytest.fixture(autouse=True)
-def signals_that_are_not_ignored():
-    """Processes inherit an ignored signal: SIGHUP from `nohup`, SIGINT from a shell's background job."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT)}
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+def ctrl_c_is_not_ignored():
+    """Processes inherit an ignored signal: SIGINT from a shell's background job."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+    signal.signal(signal.SIGINT, before)
 
 
 def descendants(pid: int) -> set[int]:
@@ -88,8 +85,6 @@ def interrupt(words: list, number: signal.Signals, folder: Path) -> int:
     ("name", "number"),
     [
         ("session", signal.SIGTERM),
-        ("session", signal.SIGKILL),
-        ("conformance", signal.SIGHUP),
         ("conformance", signal.SIGINT),
         ("conformance", signal.SIGKILL),
     ],

@@ -117,7 +117,7 @@ def test_a_session_injects_faults_into_the_emulator_that_it_started(tmp_path):
     result = json.loads(done.stdout)
     assert [item["status"] for item in result["results"]] == 5 * ["passed"] + ["failed"]
     assert result["results"][1]["detail"] == '{"faults": {"optical": {"blocked_share": 1.0}}}'
-    assert "unknown key 'blocked_shar'; did you mean blocked_share?" in result["results"][5]["detail"]
+    assert "blocked_shar: unknown key; did you mean blocked_share?" in result["results"][5]["detail"]
 
 
 def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):

@@ -50,12 +50,12 @@ def make_preview(
     camera: Camera,
     sensor: SensorModel,
     sky: SkyObjects,
-    found: Detections | None = None,
+    detected: Detections | None = None,
     solution: Solution | None = None,
 ) -> Preview:
     """Make the preview of a frame, without detections if it was not solved."""
-    background = float(np.median(frame.image[::16, ::16])) if found is None else found.background
-    noise = max(1.0, 0.0 if found is None else found.noise)
+    background = float(np.median(frame.image[::16, ::16])) if detected is None else detected.background
+    noise = max(1.0, 0.0 if detected is None else detected.noise)
     height, width = frame.image.shape
     stars, objects = frame.stars, frame.objects
     bright = stars.magnitude <= FAINTEST_V
@@ -64,13 +64,13 @@ def make_preview(
     catalogue = zip(
         hip.tolist(), *xy_px.round(1).T.tolist(), stars.magnitude[bright].round(2).tolist(), strict=True
     )
-    detections, hips = ([], []) if found is None else _detections(found, solution, sensor)
+    detections, hips = ([], []) if detected is None else _detections(detected, solution, sensor)
     overlay = {
         "width": width,
         "height": height,
         "detections": detections,
         "hips": hips,
-        "unused": [] if found is None else unused_stars(found.xy_px, hips, hip, xy_px),
+        "unused": [] if detected is None else unused_stars(detected.xy_px, hips, hip, xy_px),
         "catalogue": list(catalogue),
         "false_stars": [] if objects is None else objects.false_xy_px.round(1).tolist(),
         "bodies": _bodies(sky, camera, frame.attitude),
@@ -95,17 +95,17 @@ def compress(image: GreyImage, background: float, noise: float, bits: int) -> by
 
 
 def _detections(
-    found: Detections, solution: Solution | None, sensor: SensorModel
+    detected: Detections, solution: Solution | None, sensor: SensorModel
 ) -> tuple[list[tuple[float, float, float, float]], list[int]]:
     """Return the detections with their Hipparcos numbers."""
     zero = sensor.zero_magnitude_e_s * sensor.exposure_s
-    magnitude = -2.5 * np.log10(np.maximum(found.flux, 1.0) / zero)
-    snr = found.flux / found.flux_sigma
-    hips = np.zeros(len(found.flux), dtype=np.int64)
+    magnitude = -2.5 * np.log10(np.maximum(detected.flux, 1.0) / zero)
+    snr = detected.flux / detected.flux_sigma
+    hips = np.zeros(len(detected.flux), dtype=np.int64)
     if solution is not None and solution.valid:
         hips[solution.detection_index] = solution.hip
     rows = zip(
-        *found.xy_px.round(2).T.tolist(), magnitude.round(2).tolist(), snr.round(1).tolist(), strict=True
+        *detected.xy_px.round(2).T.tolist(), magnitude.round(2).tolist(), snr.round(1).tolist(), strict=True
     )
     return list(rows), hips.tolist()
 

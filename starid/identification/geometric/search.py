@@ -145,7 +145,7 @@ def _try_patterns(
     tests: tuple[Array, Indices],
     corners: tuple[int, int, int],
     longest_side: float,
-    found: Indices,
+    patterns: Indices,
     count: int,
     gate: float,
 ) -> float:
@@ -161,7 +161,7 @@ def _try_patterns(
     numbers[SCALE] = 1.0
     framed = False
     for n in range(count):
-        pattern = found[n]
+        pattern = patterns[n]
         a = int(np.int64(index.pattern_stars[corner_stars[pattern, 0]]))
         b = int(np.int64(index.pattern_stars[corner_stars[pattern, 1]]))
         c = int(np.int64(index.pattern_stars[corner_stars[pattern, 2]]))
@@ -241,24 +241,24 @@ def _next_triangle(i: int, j: int, k: int) -> tuple[int, int, int]:
 
 @compiled_ieee
 def identify_kernel(
-    index: IndexArrays, params: Array, xy: Array, flux: Array, sigmas: Array, given: Records
+    index: IndexArrays, params: Array, xy: Array, flux: Array, sigmas: Array, records: Records
 ) -> Answer:
     """Find the attitude of a set of detections without prior knowledge.
 
     Stage 0 tries the triangles of the brightest detections, stage 1 random triangles of more detections, and
     each further stage the triangles of the brightest detections in one part of the field. In that stage the
     sequential test uses only detections in the part, so that clutter elsewhere does not count; a candidate is
-    still refined and verified on the whole field. `given` is one record of SETTINGS.
+    still refined and verified on the whole field. `records` is one record of SETTINGS.
     """
     raw = Raw(params, xy, flux, sigmas)
-    settings: Settings = given[0]
+    settings: Settings = records[0]
     observed = observe(raw)
     n = observed.shape[0]
     candidate = new_candidate(n)
     if n < MIN_MATCHED:
         return make_answer(TOO_FEW, observed, candidate, settings, 0.0, 0, 0)
     odds, order = hit_odds(index, settings.test_window), test_order(n)
-    found = np.empty(MAX_FOUND, dtype=np.int64)
+    patterns = np.empty(MAX_FOUND, dtype=np.int64)
     spread, limit, numbers = settings.scale_tolerance, settings.max_triangles, index.numbers
     tolerance, gate = settings.search_tolerance, settings.magnitude_gate
     widest = numbers[SIDE_STEP] * SIDE_STEPS / (1.0 - spread)
@@ -298,12 +298,12 @@ def identify_kernel(
             chord(observed, b, c), chord(observed, a, c), chord(observed, a, b), a, b, c
         )
         hand = handedness(observed, a, b, c)
-        count = find_triangles(index, (s0, s1, s2), hand, bounds[2], spread, found)
+        count = find_triangles(index, (s0, s1, s2), hand, bounds[2], spread, patterns)
         triangles += 1
         candidates += count
         if count > 0:
             bound = _try_patterns(
-                index, raw, observed, settings, candidate, (odds, order), (a, b, c), s0, found, count, gate
+                index, raw, observed, settings, candidate, (odds, order), (a, b, c), s0, patterns, count, gate
             )
             if bound < 0.0:
                 break

@@ -20,16 +20,15 @@ from starid.attitude import Attitude
 from starid.attitude.wahba import solve_wahba
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
+from starid.identification.options import RsiOptions
 from starid.identification.single_camera import CheckedDetections, SingleCameraIdentifier
 from starid.identification.solution import FeatureReport, Solution
 from starid.identification.thesis.cme import matched_motion
 from starid.identification.thesis.false_stars import ObservedFrame
 from starid.identification.thesis.feature_search import ESTIMATE_SHARE, FeatureAnswer, FieldStars
 from starid.identification.thesis.lsi_identifier import (
-    REGION_DEG,
     WINDOW_PX,
     LsiIdentifier,
-    LsiOptions,
     report_of,
 )
 from starid.identification.thesis.rsi import RsiSettings, region_side
@@ -64,28 +63,6 @@ class RsiStatistics:
     triggers: int = 0
     invalid: int = 0
     region_sum_deg: float = 0.0
-
-
-@dataclass(frozen=True)
-class RsiOptions(LsiOptions):
-    """Settings of an RSI identifier, in addition to those of an LSI identifier.
-
-    Attributes
-    ----------
-    gamma_min_deg
-        Smallest side of the search region, degrees.
-    gamma_scale
-        Factor by which the side grows with the errors of the motion.
-    filter_false_stars
-        Follow the detections from frame to frame, and use only true stars for the features.
-    position_sigma_px
-        One-sigma error of a position per axis, pixels, as assumed by the filter.
-    """
-
-    gamma_min_deg: float = REGION_DEG
-    gamma_scale: float = 1.0
-    filter_false_stars: bool = True
-    position_sigma_px: float = 0.5
 
 
 @dataclass(frozen=True, eq=False)

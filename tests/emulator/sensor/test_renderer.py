@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
 from starhil.emulator.sensor.renderer import Renderer, SensorModel, render
 from starid.attitude import Attitude, random_attitude
@@ -236,14 +238,34 @@ def test_other_cameras_render(catalog: StarCatalog) -> None:
     ],
 )
 def test_bad_sensors_are_rejected_in_one_line(field: str, value: object) -> None:
-    with pytest.raises(EmulatorError, match=rf"^sensor\.{field}: must be .*, not ") as caught:
-        SensorModel().with_(**{field: value})
+    given = json.dumps(value).replace("Infinity", "inf").replace("NaN", "nan")
+    with pytest.raises(EmulatorError, match=rf"sensor\.{field}: must be .* \(given: ") as caught:
+        load_profile("ideal", [f"sensor.{field}={given}"])
     assert "\n" not in str(caught.value)
 
 
-def test_unknown_sensor_fields_are_named() -> None:
-    with pytest.raises(EmulatorError, match=r"sensor\.apperture_m: unknown key; did you mean aperture_m"):
-        SensorModel().with_(apperture_m=0.01)
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("exposure_s", 0.0, "must be at least 1e-06 (given: 0.0)"),
+        ("exposure_s", np.nan, "must be at least 1e-06 (given: nan)"),
+        ("gain", 1e4, "must be at most 1000 (given: 10000.0)"),
+        ("temperature_c", np.inf, "must be at most 150 (given: inf)"),
+        ("bits", 10, "must be one of 8, 12, 16 (given: 10)"),
+    ],
+)
+def test_limits_also_hold_for_what_changes_during_a_run(field: str, value: float, said: str) -> None:
+    with pytest.raises(EmulatorError) as caught:
+        SensorModel().with_(**{field: value})
+    assert str(caught.value) == f"sensor.{field}: {said}"
+
+
+def test_limits_have_the_same_text_in_a_profile_and_during_a_run() -> None:
+    with pytest.raises(EmulatorError) as during_a_run:
+        SensorModel().with_(gain=-1.0)
+    with pytest.raises(EmulatorError) as in_a_profile:
+        load_profile("ideal", ["sensor.gain=-1.0"])
+    assert str(in_a_profile.value).endswith(str(during_a_run.value))
 
 
 @pytest.mark.parametrize("rate", [(0.0, 0.0), (np.nan, 0.0, 0.0), (100.0, 0.0, 0.0)])
