@@ -22,8 +22,8 @@ from tests.emulator.console.browser import (
 
 pytestmark = MARKS
 
-SLOW_BYTES_S = 100_000
-"""Rate of a slow link: a third of what images at 5 Hz need."""
+SLOW_BYTES_S = 60_000
+"""Rate of a slow link: less than images at 3 Hz need."""
 
 SSH_BUFFER = 2_000_000
 """What `ssh -L` holds on the way, bytes."""
@@ -34,7 +34,7 @@ WIDTHS = (390, 820, 1280, 1920, 3840)
 
 @pytest.fixture(scope="module")
 def emulator():
-    with emulator_with_console(serial="auto", settings=["parameters.update_rate=5"]) as process:
+    with emulator_with_console(serial="auto", settings=["parameters.update_rate=3"]) as process:
         yield process
 
 
@@ -111,7 +111,7 @@ def test_what_a_hidden_page_missed_is_filled_when_it_is_shown(page):
     time.sleep(2.5)
     assert page.evaluate("starhil.store.rows.end") <= begin + 3
     page.evaluate(hide, arg=False)
-    page.wait_for_function("begin => starhil.store.rows.end >= begin + 8", arg=begin)
+    page.wait_for_function("begin => starhil.store.rows.end >= begin + 6", arg=begin)
     missing = page.evaluate(
         "begin => { const { rows } = starhil.store; let count = 0; for (let at = begin; at < rows.end; at++) count += Number.isNaN(rows.at(at, 'mode')); return count; }",
         begin,

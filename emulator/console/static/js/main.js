@@ -314,10 +314,17 @@ const KEYS = [
   ["sky", "0", "", "", () => sky.reset()],
   ["sky", "n", "n p", "next and previous star; Shift with arrows: move the enlarged image", () => {}],
   ["charts", "w", "w", "another time span; Page Up, Page Down, Home, End: move in time", () => charts.nextWindow()],
+  ["charts", "m", "m", "a note at this moment; also in Sky", () => note()],
+  ["sky", "m", "", "", () => note()],
   ["faults", "c", "c", "cover or uncover the lens", () => panels.faults.toggleCover()],
   ["truth", "s", "s", "step the stepped clock", () => panels.truth.step()],
   ["truth", "r", "r", "run or pause the stepped clock", () => panels.truth.toggleClock()],
 ];
+function note() {
+  openTab("events");
+  panels.events.note.focus();
+}
+
 const PARTS = { sky: "Sky", charts: "Error and health", faults: "Faults", truth: "Attitude" };
 const list = $("keys").querySelector("dl");
 for (const [part, , label, what] of KEYS) if (label) list.append(make("dt", { text: label }), make("dd", { text: part ? `${PARTS[part]}: ${what}` : what }));
