@@ -95,11 +95,13 @@ def test_over_a_slow_link_that_buffers_the_newest_image_is_young_and_its_age_is_
 
 def test_what_is_older_than_a_second_is_not_live(page):
     page.wait_for_function("() => document.getElementById('when').textContent === 'live'")
-    page.evaluate("window.held = []; starhil.link.socket.onmessage = (event) => held.push(event.data)")
+    page.evaluate(
+        "() => { window.held = []; starhil.link.socket.onmessage = (event) => held.push(event.data); }"
+    )
     wait_for_text(page, "#link", "slow link")
     assert page.locator("#when").text_content().endswith(" s behind")
     page.evaluate(
-        "starhil.link.socket.onmessage = (event) => starhil.link.receive(event.data); for (const data of held) starhil.link.receive(data)"
+        "() => { starhil.link.socket.onmessage = (event) => starhil.link.receive(event.data); for (const data of held) starhil.link.receive(data); }"
     )
     wait_for_text(page, "#link", "connected")
 
