@@ -268,8 +268,8 @@ class Obc:
             oracle.time_passed(self._unit.now_s)
             self.connect()
         elif any(field.parameter in ADDRESSES for field in row.named.values()) or row.action in _SETTERS:
+            self.connect()  # what follows the answer comes in the new format, from the new address
             await self.pass_time(TURN_S)
-            self.connect()
 
     def _read(self, what: str, row: Row | None, request: Request, reply: Answer) -> None:
         number = request.id if reply.row_id is None else reply.row_id

@@ -165,7 +165,7 @@ class Oracle:
         if request.telemetry:
             images = any((field.value or "").startswith(("image.", "file.")) for field in row.named.values())
             return "invalid_length" if data else None if images else "ok"
-        if len(data) != row.size:
+        if not row.has_length(data):
             return "invalid_length"
         if self.is_outside(row, data):
             return "invalid_parameter"
@@ -191,7 +191,7 @@ class Oracle:
 
     def is_outside(self, row: Row, data: bytes) -> bool:
         """Return whether a value of a telecommand is outside its limits."""
-        return any(field.fault(field.read(data)) for field in row.named.values())
+        return any(field.fault(field.read(data)) for field in row.carried(data))
 
     def _mode_verdict(self, commanded: str) -> str | None:
         running = set(self._definition.modes) - {"boot", "error"}
@@ -262,6 +262,8 @@ class Oracle:
         arguments: dict[str, Any] = dict(row.arguments)
         values = row.decode(data)
         for name, field in row.named.items():
+            if name not in values:  # the data end early
+                continue
             value = values[name]
             if field.argument in _CLOCK and not isinstance(value, (str, bytes)):
                 value = float(value) * (factor(field.unit, _CLOCK[field.argument]) or 1.0)
