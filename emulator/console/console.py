@@ -435,7 +435,7 @@ class Console:
             raise EmulatorError("record: needs `mcap`; pip install 'starhil[mcap]'") from None
         rows = self.history.rows(range(self.history.start, self.history.end))
         events, items, reasons = self.events.events(), self.trace.items(), list(self.history.reasons)
-        return await asyncio.to_thread(recorded, self._head, rows, reasons, events, items)
+        return await in_thread(recorded, self._head, rows, reasons, events, items)
 
     async def _message(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         """Return a message of the trace, with its fields and what sends it again."""

@@ -26,6 +26,7 @@ from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.control.channel import REQUEST_S
 from starhil.emulator.control.token import is_token
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth.json_lines import JsonError, parse_object
 from starhil.protocol.errors import escape_controls, reason
 from starhil.protocol.transports.connections import WINDOW, ConnectionLimit, detect_lost_peer
@@ -236,11 +237,11 @@ class ConsoleServer:
         return _download(self._console(request).trace.candump(), "wire.log", "text/plain")
 
     async def _wire_text(self, request: web.Request) -> web.Response:
-        text = await asyncio.to_thread(self._console(request).trace.text)
+        text = await in_thread(self._console(request).trace.text)
         return _download(text, "wire.txt", "text/plain")
 
     async def _wire_pcapng(self, request: web.Request) -> web.Response:
-        data = await asyncio.to_thread(pcapng, self._console(request).trace.items())
+        data = await in_thread(pcapng, self._console(request).trace.items())
         return _download(data, "wire.pcapng", "application/octet-stream")
 
     async def _record(self, request: web.Request) -> web.Response:

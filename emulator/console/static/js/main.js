@@ -3,6 +3,7 @@
 import { Charts } from "./charts.js";
 import { Events } from "./events.js";
 import { Faults } from "./faults.js";
+import { Features } from "./features.js";
 import { age, ask, degrees, duration, fixed, make, press, setText, signed, utc, wall } from "./format.js";
 import { Link, address } from "./link.js";
 import { SkyMap } from "./map.js";
@@ -68,6 +69,7 @@ const link = new Link({
 
 const sky = new Sky(store);
 new SkyMap(store);
+new Features(store);
 const charts = new Charts(store, link);
 const runs = new Runs(store);
 const panels = {
