@@ -11,10 +11,12 @@ import numpy as np
 from pydantic import BaseModel
 
 from starhil.emulator.console.history import COLUMNS, KEPT_ROWS, MODES
+from starhil.emulator.console.obc import json_integer
 from starhil.emulator.console.pointing import DEFAULT_RATE_DEG_S
 from starhil.emulator.device.clock_errors import ClockFault
 from starhil.emulator.device.telemetry_faults import TelemetryFault
 from starhil.emulator.links.table import BUSES, LINKS
+from starhil.emulator.links.traffic import CONSOLE_BUS
 from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.run import Run
 from starhil.emulator.run.faults import EFFECTS, DeviceFault
@@ -43,7 +45,9 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
     links = {key: head.ready_fields[key] for key in LINKS if key in head.ready_fields}
     return {
         "head": head.number,
-        "heads": [f"{each.number}: {each.profile.name}" for each in run.heads],
+        "heads": [
+            {"head": each.number, "unit": each.icd.name, "profile": each.profile.name} for each in run.heads
+        ],
         "columns": COLUMNS,
         "kept_rows": KEPT_ROWS,
         "modes": MODES,
@@ -51,7 +55,7 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
         "seed": head.profile.run.seed,
         "clock": run.clock.name,
         "links": links,
-        "buses": BUSES,
+        "buses": {**BUSES, CONSOLE_BUS: "console's own line"},
         "camera": head.warm.camera if head.warm is not None else head.profile.camera.values(),
         "unit": {"name": icd.name, "version": icd.version},
         "telecommands": [describe_row(row, icd) for row in icd.rows if row.kind == "telecommand"],
@@ -72,6 +76,7 @@ def describe_row(row: Row, icd: InterfaceDefinition) -> dict[str, Any]:
         "id": row.id,
         "name": row.name,
         "doc": row.doc,
+        "confirm": row.confirm,
         "fields": [_describe_field(field, icd) for field in row.named_fields.values()],
     }
 
@@ -88,7 +93,7 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
         low, high = field.physical_limits
         bounded = field.kind != "float" or field.minimum is not None or field.maximum is not None
         if bounded and abs(low) < 1e38 and abs(high) < 1e38:
-            values |= {"min": low, "max": high}
+            values |= {"min": _limit(low), "max": _limit(high)}
     if field.enum is not None:
         values["values"] = list(field.enum.values)
     if field.name == "parameter" and icd.parameters:
@@ -96,6 +101,11 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
     if field.kind == "bytes":
         values["bytes"] = field.size
     return values
+
+
+def _limit(number: float) -> float | str:
+    """Return a limit for JSON."""
+    return json_integer(number) if isinstance(number, int) else number
 
 
 def fault_controls(icd: InterfaceDefinition, buses: list[str]) -> list[dict[str, Any]]:

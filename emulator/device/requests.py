@@ -12,6 +12,7 @@ from starhil.emulator.device.counters import Acknowledge
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
+from starhil.emulator.device.signals import Executed
 from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.device.telemetry_faults import Hits, TelemetryFaults, with_flaws
 from starhil.emulator.simulation.guard import log_internal_error
@@ -71,8 +72,14 @@ class Requests:
         device.counters = device.counters.with_telecommand()
         outcome = self._execute(request, row)
         if isinstance(outcome, PendingAnswer):
-            return outcome.then(lambda code: self._acknowledge(request, row, code, device.snapshot()))
+
+            def acknowledge(code: ErrorCode) -> list[Reply]:
+                device.signals.executed.emit(Executed(request, row, code, console))
+                return self._acknowledge(request, row, code, device.snapshot())
+
+            return outcome.then(acknowledge)
         code, replies = outcome
+        device.signals.executed.emit(Executed(request, row, code, console))
         snapshot = device.snapshot()
         answered = self._answers_with_data(request, replies, snapshot, code) or self._acknowledge(
             request, row, code, snapshot

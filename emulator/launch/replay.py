@@ -39,6 +39,7 @@ from starhil.emulator.run.tape import (
     LinkItem,
     NewFaults,
     NewTruth,
+    Note,
     PipelineAnswer,
     PipelineState,
     Stored,
@@ -324,6 +325,8 @@ class _Playing:
                 if not player.writes:
                     raise _DeviationError("nothing is being written")
                 player.writes.popleft()()
+            case Note():
+                pass
             case End():
                 self.ended = True
             case _:

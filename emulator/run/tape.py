@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import cached_property
-from typing import Annotated, Literal, Self, TypeAlias
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, RootModel, field_serializer, model_validator
 
@@ -15,6 +15,9 @@ from starhil.emulator.simulation.config_model import Strict
 from starhil.emulator.truth.config import TruthConfig
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
+
+LONGEST_NOTE: Final = 500
+"""Longest note, characters."""
 
 
 class TimedEntry(Strict):
@@ -125,6 +128,13 @@ class AwaitedPhase(TimedEntry):
     phase: Phase
 
 
+class Note(TimedEntry):
+    """A note of somebody who watches the run; it changes nothing."""
+
+    do: Literal["note"] = "note"
+    text: Annotated[str, Field(max_length=LONGEST_NOTE)]
+
+
 class End(TimedEntry):
     """The end of the run."""
 
@@ -142,6 +152,7 @@ Entry: TypeAlias = (
     | NewFaults
     | ClearedFaults
     | AwaitedPhase
+    | Note
     | End
 )
 
