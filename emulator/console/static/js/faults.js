@@ -165,7 +165,8 @@ export class Faults {
         if (level !== "optical" && (item === idle[name] || item === false)) continue;
         const label = `${this.titles[level] || level}: ${name} ${shown(item)}`.trim();
         const end = make("button", { type: "button", class: "small", text: "×", "aria-label": `end ${label}`, onclick: () => this.end(level, name) });
-        chips.push(make("li", {}, make("span", { text: label }), make("fieldset", { class: "commands" }, end)));
+        const known = (this.forms[level] || []).some((each) => each.name === name) || name === "blank";
+        chips.push(make("li", {}, make("span", { text: label }), make("fieldset", { class: "commands" }, ...(known ? [end] : []))));
       }
     }
     this.now.replaceChildren(...chips);
