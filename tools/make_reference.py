@@ -44,6 +44,7 @@ UNITS: Final = {
     "quiet_s": "1/s",
     "rate_window": "frames",
     "split": "bytes",
+    "star_magnitude_noise": "mag",
     "start_unix_s": "Unix time, s",
     "width": "px",
 }

@@ -279,7 +279,9 @@ async def _serve(make: Callable[[], Emulator]) -> int:
     import gc
 
     from starhil.emulator.simulation.guard import log_loop_errors_once
+    from starhil.emulator.simulation.threads import share_interpreter
 
+    share_interpreter()
     emulator = make()
     loop = asyncio.get_running_loop()
     log_loop_errors_once(loop)

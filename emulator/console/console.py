@@ -27,6 +27,7 @@ from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.emulator.run import Run
 from starhil.emulator.run.head import Head
 from starhil.emulator.simulation.guard import log_internal_error, one_line
+from starhil.emulator.simulation.threads import in_thread
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.errors import StaridError
@@ -103,7 +104,7 @@ class Console:
         self._record_mode(device.modes.mode)
         profile = self._head.profile
         path = str(profile.folder / profile.catalog.path) if profile.catalog.path else None
-        self._stars = asyncio.create_task(asyncio.to_thread(load_bright_stars, path, profile.epoch))
+        self._stars = asyncio.create_task(in_thread(load_bright_stars, path, profile.epoch))
         loops = (self._deliver_trace, self._report_status, self._poll_telemetry)
         self._tasks = [asyncio.create_task(self._guarded(loop)) for loop in loops]
 
@@ -341,7 +342,7 @@ class Console:
         mount = None if profile.truth.mount is None else profile.truth.mount.build()
         _table(request, "to")
         truth = await self._execute({"do": "truth"})
-        wanted = await asyncio.to_thread(pointing_request, request, truth, mount, path, profile.epoch)
+        wanted = await in_thread(pointing_request, request, truth, mount, path, profile.epoch)
         return await self._execute(wanted)
 
     async def _set_clock(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:

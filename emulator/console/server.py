@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import json
 import logging
 import secrets
 import socket
+import sys
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, cast
@@ -23,7 +25,7 @@ from starhil.emulator.control.token import is_token
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.json_lines import JsonError, parse_object
 from starhil.protocol.errors import reason
-from starhil.protocol.transports.connections import WINDOW, ConnectionLimit
+from starhil.protocol.transports.connections import WINDOW, ConnectionLimit, detect_lost_peer
 
 log = logging.getLogger("starhil.console")
 
@@ -165,8 +167,14 @@ class ConsoleServer:
             response = await handler(request)
         except EmulatorError as error:
             return web.Response(status=400, text=f"{error}\n", headers=HEADERS)
+        except web.RequestPayloadError as error:
+            return web.Response(status=400, text=f"400: the body cannot be read ({error})\n", headers=HEADERS)
         except ConnectionError:  # the page is closed, and nobody reads the response
             return web.Response()
+        except OSError as error:  # of a file whose name no file system can hold
+            if error.errno != errno.ENAMETOOLONG:
+                raise
+            return web.Response(status=404, text="404: no such file\n", headers=HEADERS)
         if not response.prepared:
             response.headers.update(HEADERS)
         return response
@@ -269,11 +277,14 @@ class ConsoleServer:
 
 
 class _ServerLog(logging.LoggerAdapter[logging.Logger]):
-    """Logs a request that is not HTTP at level debug: its peer is answered with 400, and could fill the log."""
+    """Logs a request that is not HTTP, or whose body cannot be decoded, at level debug: its peer could fill the log."""
 
     def log(self, level: int, msg: object, *args: object, **options: Any) -> None:
         """Log an event of the HTTP server."""
-        from_peer = isinstance(options.get("exc_info"), HttpProcessingError)
+        error = options.get("exc_info")
+        if error is True:
+            error = sys.exception()
+        from_peer = isinstance(error, (HttpProcessingError, web.RequestPayloadError))
         super().log(logging.DEBUG if from_peer else level, msg, *args, **options)
 
 
@@ -287,6 +298,7 @@ class _Gate(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Replace this protocol by one of the server."""
         if self._limit.admits(transport, len(self._server.connections)):
+            detect_lost_peer(transport, must_read=True)
             protocol = self._server()
             transport.set_protocol(protocol)
             protocol.connection_made(transport)

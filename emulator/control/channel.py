@@ -37,13 +37,14 @@ from starhil.emulator.run.tape import ClearedFaults, NewFaults
 from starhil.emulator.run.truth_log import compare
 from starhil.emulator.sensor.pipeline.messages import as_quaternion
 from starhil.emulator.simulation.guard import until_cancelled
+from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.json_lines import JsonError, parse_object, read_lines
 from starhil.emulator.truth.live import LiveTruth
 from starhil.protocol.errors import ProtocolError, did_you_mean, remedy
 from starhil.protocol.files.validation import problems
 from starhil.protocol.icd.conventions import NANOSECONDS
-from starhil.protocol.transports.connections import ConnectionLimit
+from starhil.protocol.transports.connections import ConnectionLimit, detect_lost_peer
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
@@ -84,7 +85,8 @@ class ControlServer:
         self._opening = asyncio.Lock()
         self._quit = quit_run
         self._server: asyncio.Server | None = None
-        self._writers: set[asyncio.StreamWriter] = set()
+        self._peers: dict[asyncio.StreamWriter, bool] = {}
+        """Connections, the oldest first, and whether one of their requests was accepted."""
         self._limit = ConnectionLimit("control channel", BUSY_ANSWER)
         self._actions: dict[str, tuple[Action, tuple[str, ...] | None]] = {
             "status": (self._status, ()),
@@ -128,24 +130,37 @@ class ControlServer:
             self._server.close()
         if self._socket is not None:
             self._socket.close()
-        for writer in list(self._writers):
+        for writer in list(self._peers):
             writer.transport.abort()
 
     async def _serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if not self._limit.admits(writer.transport, len(self._writers)):
+        self._make_room()
+        if not self._limit.admits(writer.transport, len(self._peers)):
             return
-        self._writers.add(writer)
+        self._peers[writer] = False
+        if self._socket is None:
+            detect_lost_peer(writer.transport, must_read=True)
         try:
             async for line in read_lines(reader, MAX_LINE, within_s=REQUEST_S):
-                writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
+                answer = await self.answer(line)
+                if writer in self._peers:
+                    self._peers[writer] |= answer["ok"]
+                writer.write(json.dumps(answer).encode() + b"\n")
                 await writer.drain()
         except ConnectionError as error:
             log.info("control channel: connection lost (%s)", error)
         except TimeoutError:
             writer.write(LATE_ANSWER)
         finally:
-            self._writers.discard(writer)
+            self._peers.pop(writer, None)
             writer.close()
+
+    def _make_room(self) -> None:
+        """Close the oldest connection that has not shown the token, if all places are taken and there is one."""
+        stranger = next((peer for peer, accepted in self._peers.items() if not accepted), None)
+        if self._token and stranger is not None and len(self._peers) >= self._limit.size:
+            del self._peers[stranger]
+            stranger.transport.abort()
 
     async def answer(self, line: bytes | str | None) -> Answer:
         """Execute one request and return its answer; None stands for a line that was too long."""
@@ -284,7 +299,8 @@ class ControlServer:
         if self._run.wiring.records:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         name, start_s = str(request.get("name", "")), self._run.clock.now_ns() / NANOSECONDS
-        events = await asyncio.to_thread(lambda: load_scenario(name).prepare(head, self._run.truth, start_s))
+        async with self._opening:
+            events = await in_thread(lambda: load_scenario(name).prepare(head, self._run.truth, start_s))
         head.device.scheduler.add(events)
         return {"events": len(events)}
 
@@ -306,7 +322,7 @@ async def _parse(model: type[Model], value: object) -> Model:
         except ValidationError as error:
             raise EmulatorError(*map(str, problems(error, model, value, most=EXAMINED_ERRORS))) from None
 
-    return await asyncio.to_thread(parse)
+    return await in_thread(parse)
 
 
 def _check_keys(request: dict[str, Any], known: tuple[str, ...]) -> None:

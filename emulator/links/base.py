@@ -221,6 +221,7 @@ class RequestLink(Link[Item], Generic[Item, Style]):
         try:
             answer = self._requests.handle(event, console=console)
         except BaseException:
+            # later requests would wait for this one for ever
             exchange.advance(Turn.ANSWERED)
             raise
         if isinstance(answer, PendingAnswer):

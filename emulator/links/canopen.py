@@ -249,6 +249,7 @@ class CanopenLink(Link[CanFrame]):
 
     def _run_action(self, action: Action) -> None:
         """Run an action of the slave, send its frames and handle its events; nested actions run after it."""
+        # an event of the slave may cause another action, whose frames must not overtake those of this one
         self._actions.append(action)
         if self._busy:
             return
@@ -282,6 +283,7 @@ class CanopenLink(Link[CanFrame]):
         reconnects = self.transport.statistics.reconnects
         if reconnects != self._reconnects:
             self._reconnects = reconnects
+            # the error is over when it can be reported: the node is on the bus again
             code = EmergencyCode.BUS_OFF_RECOVERED
             self._run_action(partial(self.slave.raise_emergency, code, ErrorRegister.COMMUNICATION))
             self._run_action(partial(self.slave.clear_emergency, code))
@@ -332,6 +334,7 @@ class CanopenLink(Link[CanFrame]):
         self._notify_rows(self._status_rows)
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
+        # a node ID that the OBC sets replaces one that was stored by LSS
         if "canopen_node" in names and self._wanted_node != self.slave.node_id:
             try:
                 self.slave.store.clear_lss()

@@ -147,6 +147,7 @@ class CanopenProbe(Probe):
             self.drain()
             self.nmt(RESET_COMMUNICATION)
         mine = {base + self.node for base in (EMERGENCY, SDO_RESPONSE, HEARTBEAT)}
+        # a node that boots loses requests
         for _ in range(3):
             self.send_request(upload_request(0x1000, 0))
             if self.wait_for(mine, max(ANSWER_S, BOOT_S / 3) if booting else ANSWER_S) is not None:
@@ -283,6 +284,7 @@ class CanopenProbe(Probe):
 
     def send_request(self, data: bytes) -> None:
         """Send an SDO request, padded to 8 bytes."""
+        # initiates a download, an upload, a block upload or a block download: an abort has to name its object
         if data[0] >> 5 in {1, 2} or data[0] & 0xE3 == 0xA0 or data[0] & 0xE1 == 0xC0:
             self._multiplexer = data[1:4]
         self.send(SDO_REQUEST + self.node, data.ljust(SDO_SIZE, b"\0"))

@@ -237,7 +237,7 @@ class LinkProbe(Probe):
     def ask(self, row: Row | int, data: bytes = b"", message_class: str = "") -> Answer:
         """Send a request and return the answer; of an answer in several parts, the last.
 
-        Other rows that answer a request follow its reply, or stand for it.
+        Other rows that answer a request follow its reply, or replace it.
         """
         others = []
         if isinstance(row, Row):
@@ -409,6 +409,7 @@ class LinkProbe(Probe):
     def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same for all cases)
         """End a case; nothing more may arrive."""
         if passed:
+            # shorter than the silence with which most cases end by themselves: this only catches stragglers
             self.expect_silence("the case is over", self.times.quiet_s / 4)
 
     def recover(self) -> None:

@@ -94,7 +94,7 @@ def row_cases(
 
 
 def sent_cases(unit: Unit) -> Iterator[Case[LinkProbe]]:
-    """Yield the cases for a unit none of whose telemetry a request reads: those of the rows that it sends by itself."""
+    """Yield the cases for a unit whose telemetry cannot be requested: those of the rows that it sends unprompted."""
     for row in unit.telemetry.values():
         if row.is_streamed:
             yield from _telemetry(unit, row)

@@ -54,9 +54,9 @@ LONG_UPDATE_RATE_HZ: Final = (0.01, 0.02)
 FLOOD_REQUESTS: Final = (20_000, 40_000)
 """Limits of the number of requests in a flood."""
 USUAL_SHARE: Final = 0.9
-"""Share of values that are set to their default, so that the unit mostly works."""
+"""Share of values that are set to their default, so that the unit stays usable most of the time."""
 COUNTING_QUANTITIES: Final = ("counters.", "uptime", "clock.", "boot.count")
-"""Beginnings of the quantities that count."""
+"""Prefixes of the names of quantities that count."""
 ACTION_WEIGHTS: Final = {
     "set_parameter": 6.0,
     **dict.fromkeys(("save_parameters", "restore_parameters", "default_parameters"), 2.0),
@@ -75,7 +75,7 @@ EFFECTS: Final = {
     "set_mode": ("mode",),
     "clear_counters": ("counters.",),
 }
-"""Beginnings of the quantities that report the effect of an action."""
+"""Prefixes of the names of quantities that report the effect of an action."""
 NMT_COMMANDS: Final = (0x01, 0x80)
 """Start the node, and enter pre-operational; in both states SDO works."""
 EDGE_CLOCKS_S: Final = (0, 2**31 - 2, 2**31, 2**32 - 2, 2**32, 1_767_225_600)
@@ -227,7 +227,7 @@ class LifeGenerator:
                 yield self._request(self._random.choice(effects))
 
     def _reporting(self, beginnings: tuple[str, ...]) -> list[Row]:
-        """Return the telemetry that reports a quantity with one of these beginnings."""
+        """Return the telemetry that reports a quantity with one of these prefixes."""
         return [
             row
             for row in self._telemetry

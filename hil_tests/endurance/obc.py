@@ -66,7 +66,7 @@ class Obc:
                 return CanopenPort(self._definition, self._objects, deliver, take, int(address))
 
     async def pass_time(self, seconds: float, *, most: int | None = None) -> None:
-        """Let time pass, and judge what comes meanwhile."""
+        """Let time pass, and judge the messages that arrive in it."""
         await self._unit.step(seconds, most=most)
         self.hear()
         self._oracle.time_passed(self._unit.now_s)
@@ -82,14 +82,14 @@ class Obc:
     # --- what comes without a request ---
 
     def hear(self) -> None:
-        """Judge what has come without a request, in the order of its times."""
-        heard: list[tuple[float, str, Answer | CanFrame]] = []
+        """Judge the messages that no request has caused, in order of time."""
+        messages: list[tuple[float, str, Answer | CanFrame]] = []
         for link in self._unit.links:
             port = self._ports[link]
-            heard += [(at_s, link, event) for at_s, event in port.answers()]
+            messages += [(at_s, link, event) for at_s, event in port.answers()]
             if isinstance(port, CanopenPort):
-                heard += [(at_s, link, frame) for at_s, frame in port.messages()]
-        for at_s, link, event in sorted(heard, key=lambda item: item[0]):
+                messages += [(at_s, link, frame) for at_s, frame in port.messages()]
+        for at_s, link, event in sorted(messages, key=lambda item: item[0]):
             if at_s > self._oracle.now_s:
                 self._end_instant()
             if link not in self._oracle.disturbed:
@@ -174,7 +174,7 @@ class Obc:
         await self.settle(link)
 
     def _answers(self, link: str) -> list[Answer]:
-        """Return the answers on a link; packets of files that follow them are judged apart."""
+        """Return the answers on a link; packets of files that follow them are judged separately."""
         answers: list[Answer] = []
         for _, event in self._ports[link].answers():
             if event.kind not in ("unsolicited", "burst"):
@@ -268,8 +268,8 @@ class Obc:
             oracle.time_passed(self._unit.now_s)
             self.connect()
         elif any(field.parameter in ADDRESSES for field in row.named.values()) or row.action in _SETTERS:
+            self.connect()  # what follows the answer comes in the new format, from the new address
             await self.pass_time(TURN_S)
-            self.connect()
 
     def _read(self, what: str, row: Row | None, request: Request, reply: Answer) -> None:
         number = request.id if reply.row_id is None else reply.row_id
@@ -309,7 +309,7 @@ class Obc:
             await self.request(link, row, data)
 
     async def cut(self, link: str, row: Sequence[Any], share: float) -> None:
-        """Send the first part of a request, as a client that goes away, which a bus must not see answered."""
+        """Send the first part of a request, as a client that disconnects does; on a bus it must not be answered."""
         if link in self._oracle.disturbed:
             return
         known = self._definition.by_key[row[0], row[1]]

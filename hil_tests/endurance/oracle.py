@@ -94,7 +94,7 @@ class Oracle:
         self.restarted(0.0)
 
     def restarted(self, at_s: float) -> None:
-        """The unit has started at a time: at power-on, or again by itself."""
+        """The unit has started at a time: at power-on, or by a restart of its own."""
         self._started_s: float | None = at_s
         self.values.update({**self._defaults, **self._stored})
         self._at_start = {name: self.values[name] for name in AT_START}
@@ -125,22 +125,22 @@ class Oracle:
         self._has_imaged = self._has_imaged or bool(self.modes & IMAGING)
 
     def moved(self, motion: Motion) -> None:
-        """The truth was replaced, now."""
+        """The truth has been replaced."""
         self.attitudes.motions.append(motion)
 
     def failed(self) -> None:
-        """The unit must be in the error mode, now, by a fault or because its image pipeline has ended."""
+        """The unit must now be in the error mode, because of a fault or because its image pipeline has ended."""
         self.modes = {"error"}
 
     def covered(self, *, fully: bool) -> None:
-        """The lens was covered, now, or is not fully covered any more."""
+        """The lens has been covered, or is no longer fully covered."""
         if not fully:
             self.attitudes.dark_since_s = None
         elif self.attitudes.dark_since_s is None:
             self.attitudes.dark_since_s = self.now_s
 
     def forget(self) -> None:
-        """Nothing is known of parameters and counters any more, because a request had an unknown outcome."""
+        """Parameters and counters are unknown from now on, because a request had an unknown outcome."""
         self.values.update(dict.fromkeys(self.values))
         self._at_start = dict.fromkeys(AT_START)
         self._stored = dict.fromkeys(self.values)
@@ -165,7 +165,7 @@ class Oracle:
         if request.telemetry:
             images = any((field.value or "").startswith(("image.", "file.")) for field in row.named.values())
             return "invalid_length" if data else None if images else "ok"
-        if len(data) != row.size:
+        if not row.has_length(data):
             return "invalid_length"
         if self.is_outside(row, data):
             return "invalid_parameter"
@@ -191,7 +191,7 @@ class Oracle:
 
     def is_outside(self, row: Row, data: bytes) -> bool:
         """Return whether a value of a telecommand is outside its limits."""
-        return any(field.fault(field.read(data)) for field in row.named.values())
+        return any(field.fault(field.read(data)) for field in row.carried(data))
 
     def _mode_verdict(self, commanded: str) -> str | None:
         running = set(self._definition.modes) - {"boot", "error"}
@@ -262,6 +262,8 @@ class Oracle:
         arguments: dict[str, Any] = dict(row.arguments)
         values = row.decode(data)
         for name, field in row.named.items():
+            if name not in values:  # the data end early
+                continue
             value = values[name]
             if field.argument in _CLOCK and not isinstance(value, (str, bytes)):
                 value = float(value) * (factor(field.unit, _CLOCK[field.argument]) or 1.0)

@@ -55,7 +55,7 @@ def shortened(life: Life, fails: Callable[[Life], bool], *, attempts: int = 400)
 def session_of(life: Life, definition: Unit, violation: str) -> str:
     """Return a session script with the requests of a life on serial and CAN, and its waits.
 
-    What a session cannot do (faults, truth, power, CANopen) stands in a comment where it was done.
+    What a session cannot do (faults, truth, power, CANopen) is a comment at its place.
     """
     lines = [
         f"title = {json.dumps(f'{life.unit}, seed {life.seed}')}",

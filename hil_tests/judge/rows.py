@@ -343,13 +343,23 @@ class Row:
         return bytes(data)
 
     def decode(self, data: bytes) -> dict[str, Value]:
-        """Return the physical values by name.
+        """Return the physical values by name, of the fields that the data carry.
 
         Raises ValueError for a wrong length.
         """
-        if len(data) != self.size:
+        if not self.has_length(data):
             raise ValueError(f"{self.name}: {len(data)} bytes, must be {self.size}")
-        return {name: item.physical(item.read(data)) for name, item in self.named.items()}
+        return {item.name: item.physical(item.read(data)) for item in self.carried(data)}
+
+    def has_length(self, data: bytes) -> bool:
+        """Return whether the row may have so many bytes."""
+        return self.min_size <= len(data) <= self.size
+
+    def carried(self, data: bytes) -> Iterator[Field]:
+        """Yield the fields in data that may end early: those that are complete, and raw bytes as far as they go."""
+        for item in self.named.values():
+            if item.offset + item.size <= len(data) or (item.kind == "bytes" and item.offset <= len(data)):
+                yield item
 
     def faults(self, data: bytes) -> Iterator[str]:
         """Yield the values that are outside their limits, and unused bits that are not zero."""

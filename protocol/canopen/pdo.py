@@ -29,6 +29,10 @@ class ReceivePdo(Pdo):
         """Apply the current records and drop messages that wait for SYNC."""
         super().configure()
         self._size = sum(mapped.size for mapped in self._objects)
+        self.stop()
+
+    def stop(self) -> None:
+        """Drop the message that waits for SYNC, and await no other in time."""
         self._pending = None
         self.next_deadline = None
 
@@ -107,6 +111,10 @@ class TransmitPdo(Pdo):
         """Apply the current records and restart the timers and the SYNC count."""
         super().configure()
         self._keys = frozenset(mapped.entry.key for mapped in self._objects if mapped.entry is not None)
+        self.stop()
+
+    def stop(self) -> None:
+        """Drop the event that waits, and restart the timers and the SYNC count."""
         self._event = False
         self._syncs = 0
         self._started = self._sync_start.number() == 0
@@ -224,7 +232,8 @@ class PdoService:
 
     def stop(self) -> None:
         """Leave OPERATIONAL: drop all pending messages."""
-        self.configure()
+        for pdo in self._all:
+            pdo.stop()
 
     def trigger(self, keys: Iterable[tuple[int, int]]) -> None:
         """Trigger the TPDOs that map one of these objects."""

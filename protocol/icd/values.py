@@ -178,10 +178,16 @@ def representable(low: float, high: float, type_: str) -> tuple[float, float]:
     return (min(low, to_f32(low)), max(high, to_f32(high))) if type_ == "f32" else (low, high)
 
 
+WIDEST_BITS: Final = 1023
+"""Most bits of a whole number that a float can hold."""
+
+
 def number_of(value: Value) -> int | float:
     """Return the value if it is a number; raise FieldError otherwise."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise FieldError(f"{value!r} is not a number")
+    if isinstance(value, int) and value.bit_length() > WIDEST_BITS:
+        raise FieldError(f"a whole number of {value.bit_length()} bits fits no field")
     return value
 
 

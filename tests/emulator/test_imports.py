@@ -10,6 +10,8 @@ import pytest
 
 import starhil
 
+pytestmark = pytest.mark.process
+
 FOR_THE_WORKER = ("numba", "scipy", "sklearn", "cv2", "matplotlib", "erfa", "sgp4", "aiohttp", "mcap")
 
 

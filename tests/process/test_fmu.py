@@ -41,6 +41,8 @@ ERROR = 3
 LOCK_STEP = [
     *("truth.kind=live", "truth.protocol=tcp", "truth.port=0", "truth.lockstep=true", "run.clock=stepped"),
 ]
+QUICK = "quick.toml"
+"""Profile beside an FMU that starts quickly, as images do not matter."""
 WITHIN_3_SIGMA = 0.9973
 CHANCE = 1e-3
 """Probability that Gaussian errors of the stated covariance fail a test by the size of its sample."""
@@ -53,8 +55,9 @@ def fmu2(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def export(fmi: str, folder: Path) -> Path:
-    profile = folder / "acquiring.toml"
+    profile, quick = folder / "acquiring.toml", folder / QUICK
     profile.write_text('extends = "ideal"\n[parameters]\nstart_mode = "lost_in_space"\n')
+    quick.write_text(profile.read_text() + '[run]\nworker = "error_model"\n')
     target = folder / f"fmi{fmi}.fmu"
     done = run_command_line("fmu", "export", str(profile), "--fmi", fmi, "-o", str(target))
     assert done == (0, "", "")
@@ -164,7 +167,8 @@ class Unit:
         )
         self.slave.instantiate(loggingOn=True, logMessage=self._log)
         self.time = 0.0
-        for name, value in {"serial": "off", "can": "off", **parameters}.items():
+        quick = {"serial": "off", "can": "off", "profile": str(path.parent / QUICK)}
+        for name, value in {**quick, **parameters}.items():
             self.set(name, value)
 
     def _log(self, _environment: object, _status: int, _category: bytes, message: bytes) -> None:
@@ -249,7 +253,7 @@ def test_an_obc_reads_the_same_as_beside_a_simulator_that_speaks_to_the_feed(
         unit.slave.terminate()
         assert gone(link)
     command = emulator_command(
-        profile=str(fmu3.parent / "acquiring.toml"),
+        profile=str(fmu3.parent / QUICK),
         serial="auto",
         can="off",
         seed=1,
@@ -272,7 +276,7 @@ def test_an_obc_reads_the_same_as_beside_a_simulator_that_speaks_to_the_feed(
 def test_it_connects_to_an_emulator_that_runs_and_leaves_it_running(fmu3: Path, tmp_path: Path) -> None:
     control = tmp_path / "control"
     command = emulator_command(
-        profile=str(fmu3.parent / "acquiring.toml"), serial="off", can="off",  settings=LOCK_STEP,
+        profile=str(fmu3.parent / QUICK), serial="off", can="off",  settings=LOCK_STEP,
         extra=["--control", f"unix:{control}"],
     )  # fmt: skip
     with EmulatorProcess(command) as emulator:
@@ -300,7 +304,8 @@ def test_reset_begins_again_with_the_same_outputs(fmu3: Path, tmp_path: Path) ->
             seen.append([unit.get(name) for name in OUTPUTS])
             unit.slave.reset()
             assert unit.get("frame") == 0
-            unit.set("serial", "off")  # a parameter can be set again
+            unit.set("profile", str(fmu3.parent / QUICK))  # a parameter can be set again
+            unit.set("serial", "off")
     assert seen[0] == seen[1]
     assert seen[0][OUTPUTS.index("valid")]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -126,6 +127,27 @@ def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_pa
         child = int(parent.stdout.readline())
         parent.kill()
     wait_until(lambda: not alive(child), "the emulator outlived its parent")
+
+
+def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tmp_path):
+    control = tmp_path / "control"
+    text = (
+        "import sys, time\n"
+        "from starhil.emulator.cli.app import main\n"
+        "from starhil.emulator.truth import config\n"
+        "config.read_truth_file = lambda *_: time.sleep(600.0)\n"
+        f"sys.argv[1:] = ['run', 'demo', '--serial', 'off', '--can', 'off', '--control', 'unix:{control}']\n"
+        "sys.exit(main())\n"
+    )
+    with (
+        EmulatorProcess([sys.executable, "-c", text]),
+        socket.socket(socket.AF_UNIX) as peer,
+    ):  # ends by SIGTERM
+        peer.connect(str(control))
+        peer.sendall(b'{"do": "set_truth", "truth": {"kind": "file", "path": "/"}}\n')
+        peer.settimeout(0.5)
+        with pytest.raises(TimeoutError):  # it is being read
+            peer.recv(1)
 
 
 def test_an_interrupted_start_ends_the_emulator():

@@ -21,7 +21,7 @@ from starhil.hil_tests.errors import BenchError, DeviceError
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import hub_thread
 from starhil.protocol.can.frame import CanFrame
-from tests.process.conftest import FAST_BAUD
+from tests.process.conftest import FAST_BAUD, NO_IMAGES
 from tests.process.reference import frame_request
 
 pytestmark = pytest.mark.process
@@ -49,8 +49,11 @@ def own(tmp_path):
     """Make emulators with a parameter store that lasts over the test."""
     processes = []
 
-    def _make(**options) -> EmulatorProcess:
-        process = EmulatorProcess(emulator_command(seed=1, state_dir=tmp_path / "state", **options))
+    def _make(settings=(), **options) -> EmulatorProcess:
+        command = emulator_command(
+            seed=1, state_dir=tmp_path / "state", settings=[NO_IMAGES, *settings], **options
+        )
+        process = EmulatorProcess(command)
         processes.append(process)
         return process.start()
 

@@ -18,7 +18,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.pipeline.binning import mean_over_squares
-from starhil.emulator.sensor.pipeline.bodies import bodies_in_field, stars_seen, with_bodies
+from starhil.emulator.sensor.pipeline.bodies import bodies_in_field, near_any, stars_seen, with_bodies
 from starhil.emulator.sensor.pipeline.image_source import ImageSource, open_images, used_bits
 from starhil.emulator.sensor.pipeline.messages import (
     Failure,
@@ -199,6 +199,11 @@ class Pipeline:
             seen = stars_seen(stars.xy_px[stars.visible], found.xy_px) if exposure.in_field else 0
             enough = seen >= request.settings.min_stars_matched
             result = with_bodies(result, exposure.in_field, enough_stars=enough)
+            if solution.features is not None and exposure.frame.objects is not None:
+                false = near_any(found.xy_px, exposure.frame.objects.false_xy_px)
+                removed = list(solution.features.removed_index)
+                counts = int(np.count_nonzero(false)), int(np.count_nonzero(false[removed]))
+                result = replace(result, false_detected=counts[0], false_removed=counts[1])
         if request.preview:
             result = replace(result, preview=self._preview(exposure, sensor, found, solution))
         return result if current else replace(result, index_pending=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from typer.testing import CliRunner
 
 from starhil.emulator.cli import app
 from tests.emulator.cli.command_line import run_command_line
+from tests.emulator.workers import NEVER_READY
 
 
 @pytest.mark.parametrize(
@@ -45,8 +47,9 @@ def test_an_operating_system_error_is_one_line_and_status_2(
 
 
 def test_a_recording_without_the_package_of_its_extra_is_rejected_before_the_start(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, worker: Callable[..., object]
 ) -> None:
+    worker(NEVER_READY)
     monkeypatch.setitem(sys.modules, "mcap", None)  # as if it were not installed
     monkeypatch.delitem(sys.modules, "mcap.writer", raising=False)
     status, out, err = run_command_line(

@@ -387,7 +387,7 @@ def test_over_a_slow_link_images_are_left_out_and_numbers_are_not(page, browser,
         slow.goto(emulator.ready["view"].replace(str(port), str(slow_port)))
         slow.wait_for_function("() => starhil.store.images.length > 0")
         begin = slow.evaluate("starhil.store.now")
-        slow.wait_for_function("begin => starhil.store.now > begin + 15", arg=begin)
+        slow.wait_for_function("begin => starhil.store.now > begin + 9", arg=begin)
         behind_s = page.evaluate("starhil.store.now") - slow.evaluate("starhil.store.images.at(-1).time")
         numbers = slow.evaluate(
             """begin => {

@@ -135,6 +135,30 @@ def test_a_header_that_is_not_ascii_is_answered_400(run, caplog, header):
     assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
 
 
+@pytest.mark.parametrize(
+    ("request_", "status"),
+    [
+        ("GET /static/" + 300 * "a", 404),
+        ("POST /runs?{token}", 400),
+        ("POST /runs", 403),
+    ],
+    ids=["name", "body", "body without the token"],
+)
+def test_a_name_or_a_body_that_cannot_be_read_leaves_no_error_in_the_log(run, caplog, request_, status):
+    async def scenario(emulation, _line):
+        host, path = emulation.ready_fields["view"].removeprefix("http://").split("/")
+        reader, writer = await asyncio.open_connection(*host.split(":"))
+        line = request_.format(token=path.removeprefix("?"))
+        body = "Content-Encoding: gzip\r\nContent-Length: 5\r\n\r\n....."
+        writer.write(f"{line} HTTP/1.1\r\nHost: {host}\r\n{body}".encode())
+        assert f" {status} ".encode() in await reader.readline()
+        await reader.read()
+        writer.close()
+
+    run(scenario, options=OPTIONS)
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
+
+
 def test_previews_are_made_only_while_a_page_shows_images(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)

@@ -120,6 +120,39 @@ def test_a_refusal_without_an_answer_is_reported_by_telemetry_that_comes_before_
     assert run_once(Life("cubestar", 1, ("serial", "can"), profile, steps)).violation == ""
 
 
+@pytest.mark.parametrize(("row", "data"), [(8, "58818bfce2"), (7, "79"), (9, "040010"), (13, "000010")])
+def test_data_of_a_telecommand_may_end_early_where_the_definition_says_so(row, data):
+    short = {"do": "request", "link": "serial", "row": ["", row, "telecommand"], "data": data}
+    outcome = run_once(Life("st16", 1, ("serial",), {}, (short,)))
+    assert (outcome.violation, outcome.requests) == ("", 1)
+
+
+def test_data_that_end_before_they_may_are_still_found(monkeypatch):
+    taken = Row.decode
+    monkeypatch.setattr(Row, "decode", lambda row, data, **how: taken(row, data.ljust(row.min_size), **how))
+    short = {"do": "request", "link": "serial", "row": ["", 8, "telecommand"], "data": "58818bfc"}
+    assert run_once(Life("st16", 1, ("serial",), {}, (short,))).violation.endswith("must be refused")
+
+
+@pytest.mark.parametrize("parameter", ["serial_dialect", "can_address"])
+def test_telemetry_that_comes_right_after_a_new_format_or_address_has_it(parameter):
+    icd = load_unit("cubestar")
+    select, change = icd.telecommands["set_unsolicited"], icd.telecommands["set_parameter"]
+    link = "serial" if parameter == "serial_dialect" else "can"
+    stream = select.encode({"telemetry": 165, "rate": 4.9}).hex()
+    data = change.encode({"parameter": icd.parameters[parameter].id, "value": 2.0}).hex()
+    steps = (
+        request_on("can", select, stream),
+        request_on(link, change, data),
+        {"do": "wait", "s": 3.0},
+    )
+    outcome = run_once(
+        Life("cubestar", 1, ("serial", "can"), {"parameters": {"start_mode": "standby"}}, steps)
+    )
+    assert outcome.violation == ""
+    assert outcome.readings > 10
+
+
 def node_id_set(*then):
     """Return the outcome of a life in which the node ID is set to 127 and stored, and then this happens."""
     icd = load_unit("cubestar")

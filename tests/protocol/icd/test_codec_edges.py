@@ -72,6 +72,16 @@ def test_a_float_outside_its_limits_is_refused_when_received(icd, value):
         row.decode(data)
 
 
+@pytest.mark.parametrize("field", ["single", "double", "centi"])
+@pytest.mark.parametrize("digits", [400, 20_000])
+def test_a_whole_number_beyond_all_floats_is_rejected(icd, field, digits):
+    values = {"single": 0.0, "double": 0.0, "centi": 0.0, field: -(16**digits)}
+    with pytest.raises(
+        FieldError, match=rf"set.{field}: a whole number of {4 * digits + 1} bits fits no field"
+    ):
+        icd.telecommands["set"].encode(values)
+
+
 @pytest.mark.parametrize(
     ("value", "raw", "read"), [(11.0, 2.0, 11.0), (-99.0, -40.0, -10.0), (99.0, 40.0, 30.0)]
 )

@@ -73,6 +73,7 @@ def test_no_sub_command_has_two_programs() -> None:
     assert {*COMMANDS} & {*app.COMMANDS} == {"bench"}
 
 
+@pytest.mark.process
 def test_only_the_module_of_the_given_sub_command_is_imported() -> None:
     program = "import sys; from starid.cli import app; app.build_app(['catalog']); print(*sys.modules)"
     done = subprocess.run(

@@ -2,6 +2,7 @@
 
 import { Charts } from "./charts.js";
 import { Faults } from "./faults.js";
+import { Features } from "./features.js";
 import { age, degrees, duration, fixed, make, press, setText, signed, utc, wall } from "./format.js";
 import { Link, address } from "./link.js";
 import { SkyMap } from "./map.js";
@@ -62,6 +63,7 @@ const link = new Link({
 
 const sky = new Sky(store);
 new SkyMap(store);
+new Features(store);
 const charts = new Charts(store);
 const panels = {
   telemetry: new Telemetry(store, link),

@@ -1,5 +1,6 @@
 // The whole sky in Hammer's equal-area projection: bright stars, the trail of the boresight, Sun, Moon and Earth.
 
+import { drawRegion } from "./features.js";
 import { colour, onTheme, pen } from "./theme.js";
 
 const RAD = Math.PI / 180;
@@ -102,6 +103,7 @@ export class SkyMap {
     const head = store.image && store.image.head;
     for (const body of (head && head.bodies) || []) this.drawBody(context, body);
     if (head && head.true_q && store.hello.camera) this.drawField(context, head);
+    if (head) drawRegion(context, head, (points) => this.line(context, points));
     context.fillStyle = colour("b");
     context.beginPath();
     context.arc(...this.place(...trail[0]), 3 * pen(), 0, 2 * Math.PI);

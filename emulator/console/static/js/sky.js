@@ -1,5 +1,6 @@
 // The sensor image with matched, unmatched and missing stars.
 
+import { drawRemoved } from "./features.js";
 import { fixed, press, setText } from "./format.js";
 import { colour, onTheme, pen } from "./theme.js";
 
@@ -161,6 +162,7 @@ export class Sky {
     setText(document.getElementById("zoom"), `${this.zoom.toFixed(1)}×`);
     if (this.layers.bodies) this.drawBodies(marks, head);
     this.drawStars(marks, head);
+    drawRemoved(marks, head, (x, y) => this.place(x, y));
     if (this.layers.bodies) this.drawRate(marks, head);
     this.point();
   }
