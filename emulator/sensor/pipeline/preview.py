@@ -12,6 +12,8 @@ The overlay is JSON; places in the image are pairs x, y, pixels:
 - ``false_stars``: their places;
 - ``bodies``: ``name`` (`sun`, `moon`, `earth`, or that of a planet), ``ra_deg`` and ``dec_deg`` of the centre, ICRS, angular
   ``radius_deg`` (0 for a point), and ``outline_px`` of the disc, null where the lens maps no direction;
+- ``features``: how an algorithm of the thesis worked, null for `geometric`: the fields of
+  `starid.identification.solution.FeatureReport` that the page shows;
 - ``covered``: polygons of the areas that are covered by something near the lens.
 """
 
@@ -32,7 +34,7 @@ from starhil.emulator.sensor.sky.objects import CelestialBody, Obstruction, SkyO
 from starid.arrays import Array, GreyImage, Indices32
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.identification.solution import Solution
+from starid.identification.solution import FeatureReport, Solution
 from starid.imaging.detection import Detections
 
 JPEG_QUALITY: Final = 72
@@ -74,6 +76,7 @@ def make_preview(
         "catalogue": list(catalogue),
         "false_stars": [] if objects is None else objects.false_xy_px.round(1).tolist(),
         "bodies": _bodies(sky, camera, frame.attitude),
+        "features": None if solution is None else _features(solution.features),
         "covered": [_covered(obstruction, width, height) for obstruction in sky.obstructions],
     }
     content = json.dumps(overlay, separators=(",", ":")).encode()
@@ -120,6 +123,24 @@ def unused_stars(detections_xy: Array, hips: list[int], hip: Indices32, xy_px: A
         if row >= 0 and distances[row] <= SEEN_PX and hips[row] == unused[row] == 0:
             unused[row] = number
     return unused
+
+
+def _features(report: FeatureReport | None) -> dict[str, Any] | None:
+    """Return the part of a report that a page shows."""
+    if report is None:
+        return None
+    return {
+        "search": report.search,
+        "triggered": report.triggered,
+        "refined": report.refined,
+        "error_psi": None if math.isnan(report.error_psi) else round(report.error_psi, 3),
+        "weights": report.weights,
+        "observed": [round(value, 2) for value in report.observed],
+        "of_cell": [round(value, 2) for value in report.of_cell],
+        "region_deg": round(report.region_deg, 2),
+        "region_at_deg": [round(value, 3) for value in report.region_at_deg],
+        "removed": list(report.removed_index),
+    }
 
 
 def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[dict[str, Any]]:

@@ -177,6 +177,11 @@ class SkyObjects:
     """Number of false stars at random positions that stay the same during a run."""
     false_star_magnitudes: tuple[float, float] = limited(-5.0, 20.0, (1.0, 5.5))
     """Range of the magnitudes of false stars, brighter first; uniformly distributed."""
+    star_position_noise_px: float = limited(0.0, 100.0, 0.0)
+    """Standard deviation of a displacement of each star along each axis, random in every frame: the position noise with
+    which Özyurt's thesis tests its algorithms, in addition to the sensor's own noise."""
+    star_magnitude_noise: float = limited(0.0, 5.0, 0.0)
+    """The same of a change of each star's magnitude."""
     missing_stars: int = limited(0, _MAX_OBJECTS, 0)
     """Number of catalogue stars omitted, the brightest in the field."""
     cosmic_rays_s: float = limited(0.0, 1e6, 0.0)
