@@ -8,10 +8,13 @@ import typing
 from typing import Any, Final
 
 import numpy as np
+from pydantic import BaseModel
 
 from starhil.emulator.console.history import COLUMNS, KEPT_ROWS, MODES
 from starhil.emulator.console.obc import json_integer
 from starhil.emulator.console.pointing import DEFAULT_RATE_DEG_S
+from starhil.emulator.device.clock_errors import ClockFault
+from starhil.emulator.device.telemetry_faults import TelemetryFault
 from starhil.emulator.links.table import BUSES, LINKS
 from starhil.emulator.links.traffic import CONSOLE_BUS
 from starhil.emulator.links.wire_faults import WireFault
@@ -110,19 +113,21 @@ def fault_controls(icd: InterfaceDefinition, buses: list[str]) -> list[dict[str,
     choices = {
         **{key: effect.names(icd) for key, effect in EFFECTS.items() if effect.enum},
         "parameter": list(icd.device_parameters),
+        "row": list(icd.telemetry),
+        "answer_with": list(icd.telemetry),
     }
     share = {"name": "blocked_share", "kind": "number", "min": 0.0, "max": 1.0, "default": 0.0}
     levels = [
         {"level": "optical", "title": "sky and optics", "controls": [share, *_class_controls(SkyObjects)]},
         {"level": "device", "title": "device", "controls": _model_controls(DeviceFault, choices)},
+        {"level": "clock", "title": "clock", "controls": _model_controls(ClockFault, choices)},
+        {"level": "telemetry", "title": "telemetry", "controls": _model_controls(TelemetryFault, choices)},
     ]
     wire = _model_controls(WireFault, choices)
     return levels + [{"level": bus, "title": BUSES[bus], "controls": wire} for bus in dict.fromkeys(buses)]
 
 
-def _model_controls(
-    model: type[DeviceFault | WireFault], choices: dict[str, list[str]]
-) -> list[dict[str, Any]]:
+def _model_controls(model: type[BaseModel], choices: dict[str, list[str]]) -> list[dict[str, Any]]:
     schema = model.model_json_schema()
     return _schema_controls(schema["properties"], schema.get("$defs", {}), choices)
 
@@ -131,7 +136,14 @@ def _schema_controls(
     properties: dict[str, Any], models: dict[str, Any], choices: dict[str, list[str]]
 ) -> list[dict[str, Any]]:
     """Return the controls for a model from its JSON schema; a nested model becomes a group."""
-    kinds = {"boolean": "flag", "integer": "integer", "number": "number", "string": "choice"}
+    kinds = {
+        "boolean": "flag",
+        "integer": "integer",
+        "number": "number",
+        "string": "choice",
+        "array": "list",
+        "object": "table",
+    }
     controls: list[dict[str, Any]] = []
     for name, schema in properties.items():
         content = schema["anyOf"][0] if "anyOf" in schema else schema
@@ -148,7 +160,7 @@ def _schema_controls(
                 "min": content.get("minimum"),
                 "max": content.get("maximum"),
                 "default": schema.get("default"),
-                "values": choices.get(name),
+                "values": content.get("enum", choices.get(name)),
             }
         )
     return controls

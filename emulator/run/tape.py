@@ -8,6 +8,7 @@ from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, RootModel, field_serializer, model_validator
 
+from starhil.emulator.device.cycle import Phase
 from starhil.emulator.links.table import LINKS, LinkName
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.simulation.config_model import Strict
@@ -120,6 +121,13 @@ class ClearedFaults(TimedEntry):
     do: Literal["clear_faults"] = "clear_faults"
 
 
+class AwaitedPhase(TimedEntry):
+    """A wait for a phase of the next exposure, which is an event of the device."""
+
+    do: Literal["wait"] = "wait"
+    phase: Phase
+
+
 class Note(TimedEntry):
     """A note of somebody who watches the run; it changes nothing."""
 
@@ -143,6 +151,7 @@ Entry: TypeAlias = (
     | NewTruth
     | NewFaults
     | ClearedFaults
+    | AwaitedPhase
     | Note
     | End
 )

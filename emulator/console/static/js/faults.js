@@ -60,8 +60,8 @@ export class Faults {
     } else if (control.kind === "choice") {
       input = make("select", {}, make("option", { value: "", text: "–" }), ...(control.values || []).map((item) => make("option", { value: item, text: item })));
       read = () => input.value || undefined;
-    } else if (control.kind === "list") {
-      input = make("input", { placeholder: control.name.endsWith("magnitudes") ? "[1.0, 5.5]" : "[{…}], JSON", spellcheck: "false" });
+    } else if (control.kind === "list" || control.kind === "table") {
+      input = make("input", { placeholder: EXAMPLES[control.name] || "[{…}], JSON", spellcheck: "false" });
       read = () => (input.value.trim() ? JSON.parse(input.value) : undefined);
     } else if (control.kind === "text") {
       input = make("input", { spellcheck: "false" });
@@ -173,6 +173,9 @@ export class Faults {
     this.store.emit("faults", chips.map((chip) => chip.firstChild.textContent));
   }
 }
+
+// How a list or table is written, by the name of its control.
+const EXAMPLES = { false_star_magnitudes: "[1.0, 5.5]", set: '{"q_x": 0.5}', offset: '{"q_x": 0.1}', nan: '["q_x"]', negate: '["q_x"]', turn_deg: "[0, 0.5, 0]" };
 
 // The value of a fault in one line.
 function shown(item) {
