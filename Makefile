@@ -1,5 +1,6 @@
 # make demo        set up and run the product end to end; results in out/demo
 # make test        set up and run all tests (those on a real vcan0 in a guest); the last lines say what ran, and why tests were skipped
+# make check       for whoever edits, a minute and a half: ruff, contracts of imports, and tests without processes and long computations
 # make lowest      the tests of LOWEST with the lowest versions of dependencies that pyproject.toml admits
 # make lint        ruff, mypy --strict and the contracts of imports
 # make docs        pages and API reference in out/docs; a warning or a broken link fails
@@ -25,7 +26,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 # a target whose recipe failed is made again: the file .venv/pyvenv.cfg is written before pip is found to be missing
 .DELETE_ON_ERROR:
-.PHONY: help demo test lowest lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos obc clean
+.PHONY: help demo check test lowest lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos obc clean
 help:
 	@sed -n 's/^# make /make /p' Makefile
 
@@ -50,9 +51,25 @@ test: $(VENV)/.developer
 	-@tools/install_test_packages tests obc
 	@tools/test_in_lanes $(BIN)/python
 
+# of `check`, beside the tests that start processes: what computes for long, and few changes touch
+LONG := $(addprefix tests/,process fuzzing conformance hil_tests/endurance emulator/benchmarks starid/kernels starid/lab starid/identification/thesis) \
+	$(wildcard tests/protocol/canopen/test_conformance*.py) tests/protocol/test_fuzz.py
+QUICK = $(BIN)/python -m pytest -q -m "not process and not browser and not socketcan" $(LONG:%=--ignore=%)
+check: $(VENV)/.developer
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	@$(QUICK) tests/protocol tests/starid >.venv/check.log 2>&1 & other=$$!; \
+		$(QUICK) --ignore=tests/protocol --ignore=tests/starid; status=$$?; \
+		wait $$other || status=1; cat .venv/check.log; exit $$status
+
 # what only tests need is of today; oem and others of the extra `test` need more than the lowest versions
 LOWEST_TOOLS := 'pytest>=8' 'hypothesis>=6.100' msgpack cantools canmatrix space_packet_parser dcf-tools durand spiceypy
-LOWEST := tests/protocol $(addprefix tests/emulator/,device links sensor/pipeline truth) $(addprefix tests/starid/,imaging identification/geometric camera catalog)
+# the tests of what calls dependencies, one line for each group of them: pydantic and xxhash, pyserial and python-can, canopen and
+# construct, jinja2; typer and rich, aiohttp, SciPy, OpenCV, pyerfa and sgp4; numpy, numba and the catalogue
+LOWEST := $(addprefix tests/protocol/,unit/test_reader.py unit/test_units.py unit/test_unit_check.py serial transports canopen export) \
+	$(addprefix tests/emulator/,cli/test_app.py console/test_server.py profile device/test_extreme_values.py sensor truth) \
+	$(addprefix tests/starid/,imaging identification/geometric camera catalog kernels)
 out/lowest/.installed: pyproject.toml tools/lowest_versions.py
 	$(PYTHON) -m venv out/lowest
 	$(PYTHON) tools/lowest_versions.py >out/lowest/constraints.txt
@@ -60,7 +77,8 @@ out/lowest/.installed: pyproject.toml tools/lowest_versions.py
 	@touch $@
 
 lowest: out/lowest/.installed
-	nice out/lowest/bin/python -m pytest -q -m "not process and not browser and not socketcan" $(LOWEST)
+	nice out/lowest/bin/python -m pytest -q -m "not process and not browser and not socketcan" \
+		-k "not fuzz and not stateful and not mutant and not durand" $(LOWEST)
 
 lint: $(VENV)/.developer
 	$(BIN)/ruff check .

@@ -1,6 +1,6 @@
-"""The error of everything that reads a file, opens a port or takes a value from outside, and cannot.
+"""The error raised by whatever reads a file, opens a port or takes input from outside.
 
-A docstring mentions it only where the reader needs to know more than that.
+A docstring mentions it only where that does not go without saying.
 """
 
 from __future__ import annotations

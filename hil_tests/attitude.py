@@ -147,14 +147,14 @@ def cross(a: Vector, b: Vector) -> Vector:
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
-def from_directions(seen: tuple[Vector, Vector], known: tuple[Vector, Vector]) -> Quaternion:
+def from_directions(in_sensor: tuple[Vector, Vector], in_icrs: tuple[Vector, Vector]) -> Quaternion:
     """Return the attitude with which two directions in ICRS are seen in the sensor (TRIAD, Black 1964)."""
 
     def triad(first: Vector, second: Vector) -> list[list[float]]:
         third = cross(first, second)
         return [[part / math.hypot(*axis) for part in axis] for axis in (first, third, cross(first, third))]
 
-    pairs = list(zip(triad(*seen), triad(*known), strict=True))
+    pairs = list(zip(triad(*in_sensor), triad(*in_icrs), strict=True))
     return from_matrix(
         [[sum(a[row] * b[column] for a, b in pairs) for column in range(3)] for row in range(3)]
     )

@@ -30,15 +30,25 @@ if TYPE_CHECKING:
     from starhil.protocol.files.bundled import Kind
 
 
-NAMED: Final[dict[Kind, str]] = {"unit": "--starhil-unit", "profile": "--starhil-profile"}
+FILE_OPTIONS: Final[dict[Kind, str]] = {"unit": "--starhil-unit", "profile": "--starhil-profile"}
 """Options that name what ships with the package, or a file."""
+_OF_EMULATOR: Final = (None, "auto", "off")
+"""Values of the options of links that name no unit."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add options that name a unit or the profile of the emulator."""
     group = parser.getgroup("starhil", "star sensor under test")
-    group.addoption("--starhil-serial", metavar="DEV", help="serial port of a unit, instead of an emulator")
-    group.addoption("--starhil-can", metavar="CHANNEL", help="CAN channel of a unit, instead of an emulator")
+    group.addoption(
+        "--starhil-serial",
+        metavar="DEV",
+        help="serial port of a unit, instead of an emulator (auto); off: none",
+    )
+    group.addoption(
+        "--starhil-can",
+        metavar="CHANNEL",
+        help="CAN channel of a unit, instead of an emulator (auto); off: none",
+    )
     group.addoption(
         "--starhil-dialect",
         choices=["a", "b", "c"],
@@ -64,7 +74,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", "starhil(profile=None, settings=()): profile and settings of the emulator for a test"
     )
-    for kind, option in NAMED.items():
+    for kind, option in FILE_OPTIONS.items():
         if (name := config.getoption(option)) is not None:
             from starhil.protocol.files.bundled import find, not_found
 
@@ -142,7 +152,12 @@ def _starhil_emulators(
 def _unit_option(config: pytest.Config) -> str:
     """Return the option that names a unit, or an empty text if tests run with an emulator."""
     return next(
-        (name for name in ("--starhil-serial", "--starhil-can") if config.getoption(name) is not None), ""
+        (
+            name
+            for name in ("--starhil-serial", "--starhil-can")
+            if config.getoption(name) not in _OF_EMULATOR
+        ),
+        "",
     )
 
 
@@ -171,12 +186,14 @@ def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
 
     option = request.config.getoption
     spec, unit, other = option(f"--starhil-{link}"), option("--starhil-unit"), _unit_option(request.config)
-    if spec is not None and request.node.get_closest_marker("starhil") is not None:
+    if spec == "off":
+        pytest.skip(f"--starhil-{link} off")
+    if spec not in _OF_EMULATOR and request.node.get_closest_marker("starhil") is not None:
         pytest.skip(f"{other} names a unit, and the marker starhil needs an emulator")
-    if spec is None and other:
+    if spec in _OF_EMULATOR and other:
         where = {"serial": "port", "can": "bus"}[link]
         pytest.skip(f"{other} names a unit; give its {where} with --starhil-{link} to run this test")
-    if spec is None:
+    if spec in _OF_EMULATOR:
         emulator: EmulatorProcess = request.getfixturevalue("starhil_emulator")
         spec, unit = emulator.ready.get(link), emulator.unit
         if spec is None:

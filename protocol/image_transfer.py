@@ -1,7 +1,7 @@
 """Transfer of images and files, for both ends: image frames with a checksum, burst packets and the hole map.
 
-Image frames follow the CubeSense node, bursts the CubeComputer. The checksum of a frame is our own choice. That of
-files and blocks is a CRC-16 that begins with 0 (EnduroSat cubeadcs); its polynomial is not public and our own choice.
+Image frames follow the CubeSense node, bursts the CubeComputer. The checksum of an image frame is our own choice. Files
+and blocks have a CRC-16 with initial value 0 (EnduroSat cubeadcs); its polynomial is not public, so it is our own choice.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum, IntEnum, StrEnum
+from enum import Enum, Flag, IntEnum, StrEnum
 from typing import Final, Protocol, TypeVar
 
 Arriving_contra = TypeVar("Arriving_contra", contravariant=True)
@@ -21,7 +21,6 @@ DEFAULT_TIMEOUT_S: Final = 0.5
 """Silence within a message after which it is abandoned."""
 
 BURST_ID: Final = 119
-"""ID of the packets of a file burst."""
 
 
 class ErrorCode(IntEnum):
@@ -77,9 +76,7 @@ class FaultKind(Enum):
     UART_SHORT = "uart_short"
     """A message shorter than header and check."""
     UART_CHECK = "uart_check"
-    """A message with a wrong check."""
     UART_ADDRESS = "uart_address"
-    """A message to another address."""
     CAN_SEQUENCE = "can_sequence"
     """A segment out of order."""
     CAN_INCOMPLETE = "can_incomplete"
@@ -92,6 +89,16 @@ class FaultKind(Enum):
     """A segmented message longer than the receiver accepts, or too many incomplete messages."""
 
 
+class Flaw(Flag):
+    """Errors in a message that is sent with them on purpose, and is well-formed otherwise."""
+
+    NONE = 0
+    CHECK = 1
+    """A wrong check, on a serial line that has one."""
+    SEQUENCE = 2
+    """A wrong sequence number in the header, or a wrong segment counter on CAN."""
+
+
 @dataclass(frozen=True, slots=True)
 class Request:
     """A telecommand with its parameters, or a request for telemetry."""
@@ -102,7 +109,7 @@ class Request:
     data: bytes = b""
     source: int = 0
     """Address of the sender; 0 on a serial line whose messages carry none."""
-    klass: str = ""
+    message_class: str = ""
     """Class of the row, if the unit has classes."""
     sequence: int = 0
     """Sequence number in the header, if any; the reply repeats it."""
@@ -132,7 +139,7 @@ class Reply:
     """Address of the receiver (set on the device side); 0 on a serial line whose messages carry none."""
     source: int = 0
     """Address of the sender (set on the OBC side); 0 on a serial line whose messages carry none."""
-    klass: str = ""
+    message_class: str = ""
     """Class of the row, if the unit has classes."""
     sequence: int = 0
     flags: int = 0
@@ -142,6 +149,8 @@ class Reply:
     """Time since the device started, if the header carries `ticks`."""
     time_ns: int = 0
     """Time of the device's clock since the unit's epoch, if the header carries `time`."""
+    flaw: Flaw = Flaw.NONE
+    """Errors with which it is sent (set on the device side)."""
 
     @classmethod
     def echo(cls, request: Request) -> Reply:
@@ -151,7 +160,7 @@ class Reply:
             request.id,
             request.data,
             destination=request.source,
-            klass=request.klass,
+            message_class=request.message_class,
             sequence=request.sequence,
             flags=request.flags,
         )

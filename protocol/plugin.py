@@ -12,9 +12,10 @@ Example of `unit.py` beside the TOML files of a unit with `plugin = "unit.py"` i
     def blink(device, arguments):
         device.reset("command")
 
-The function of a quantity is called with a `starhil.emulator.device.snapshot.Snapshot`, the device at one moment, from
-which the whole row is packed: it has neither the device nor a clock. docs/quantities.md lists its fields. The function of an action is called with the device and the arguments by name; it returns nothing, messages that
-follow the answer, or `bytes`, which are the data of the answer; a list of `bytes` makes several answers.
+The function of a quantity gets a `starhil.emulator.device.snapshot.Snapshot`: the device at one moment, from which the
+whole row is packed. It has access to neither the device nor a clock. docs/quantities.md lists the fields of a snapshot.
+The function of an action gets the device, and the arguments by name. It returns nothing, messages that follow the answer,
+or `bytes`, the data of the answer; a list of `bytes` makes several answers.
 A framing is a class derived from `starhil.protocol.serial.framings.Framing`, whose constructor takes no arguments; a
 check is a function that returns the check of the covered bytes. docs/your-unit.md has an example of each.
 """

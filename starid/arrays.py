@@ -14,13 +14,11 @@ Indices = NDArray[np.int64]
 """Indices, counts and other integers."""
 
 Mask = NDArray[np.bool_]
-"""A selection of rows."""
 
 Array32 = NDArray[np.float32]
 """Single-precision numbers: pixels, and what is computed from them."""
 
 Indices32 = NDArray[np.int32]
-"""32-bit integers."""
 
 Records = NDArray[np.void]
 """A table (n,) of records, each with named fields (`record_type`)."""

@@ -9,6 +9,8 @@ import sys
 import tomllib
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -20,6 +22,7 @@ def test_the_installed_version_matches_the_project():
     assert importlib.metadata.version("starhil") == project_version()
 
 
+@pytest.mark.process
 def test_the_command_prints_the_version():
     done = subprocess.run(
         [sys.executable, "-c", "from starhil.emulator.cli import main; main()", "--version"],

@@ -28,6 +28,9 @@ CROSS_LIMIT_ARCSEC = 60.0
 ROLL_LIMIT_ARCSEC = 300.0
 
 
+FEATURES_SESSION = "recursive_features"
+"""Session with the thesis's algorithm."""
+
 SESSIONS = {"serial": "demo_serial", "can": "demo_can"}
 """Link, which also names the folder of its logs → session of the OBC over it."""
 
@@ -79,6 +82,24 @@ def run_session(link: str, channel: str, out: Path, truth_log: Path) -> bool:
         "--log", str(folder), "--junit", str(folder / "junit.xml"), "--truth", str(truth_log),
     ]  # fmt: skip
     return subprocess.run(command, check=False).returncode == 0
+
+
+def run_features(out: Path) -> str | None:
+    """Let the thesis's algorithm lose the sky and find it again, with an emulator of its own; return what it did, if it passed."""
+    folder = out / "features"
+    command = [
+        str(Path(sys.executable).with_name("starhil")), "session", FEATURES_SESSION, "--start", "--can", "auto",
+        "--log", str(folder),
+    ]  # fmt: skip
+    if subprocess.run(command, check=False).returncode != 0:
+        return None
+    images = read_csv(folder / "truth.csv")
+    refined = images["refined"] == "true"
+    region = np.count_nonzero(refined & (images["search"] == "rsi"))
+    return (
+        f'run.algorithm = "rsi": features found, and stars verified, {np.count_nonzero(refined)} of {len(images)} images, '
+        f"{region} of them in the region of search, with the lens covered in between"
+    )
 
 
 def within_limits(found: Comparison) -> bool:
@@ -145,9 +166,14 @@ def main() -> int:
     if not all(passed):
         console.print("demo: a session failed; see its steps above", style="red")
         return 1
+    features = run_features(out)
+    if features is None:
+        console.print("demo: the session with features failed; see its steps above", style="red")
+        return 1
     truth = read_csv(truth_log)
     comparisons = {link: compare(read_csv(out / link / "attitude.csv"), truth) for link in SESSIONS}
     good = report(comparisons, console)
+    console.print(features)
     console.print(
         f"Images: {', '.join(map(str, sorted(out.rglob('*.png'))))}; logs in the same folders.\n"
         "The images fill 235×235 and 469×469 pixels of the sizes that the unit downloads; the rest is black."

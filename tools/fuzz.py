@@ -36,7 +36,8 @@ SLOWEST_S = 20
 MEMORY_MB = 3000
 CORPUS_BYTES = 3000
 INSTRUMENTED = (
-    "starhil.protocol", "starhil.hil_tests.session.script", "starhil.hil_tests.session.steps", "starhil.hil_tests.session.expect",
+    "starhil.protocol", "starhil.hil_tests.session.script", "starhil.hil_tests.session.steps", "starhil.hil_tests.session.step_keys",
+    "starhil.hil_tests.session.expect",
     "starhil.hil_tests.client.images", "starhil.hil_tests.client.raw_traffic", "starhil.hil_tests.rig.truth_log",
     "starhil.hil_tests.rig.emulator_process", "starhil.emulator.control", "starhil.emulator.console",
     "starhil.emulator.device", "starhil.emulator.truth", "starhil.emulator.profile",

@@ -22,7 +22,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, cast, get_args, get_type_hints
+from typing import Any, Final, get_args
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -37,6 +37,8 @@ UNITS: Final = {
     "anomaly_s": "1/s",
     "baud": "Bd",
     "cosmic_rays_s": "1/s",
+    "drift_ppm": "ppm",
+    "drift_ppm_c": "ppm/°C",
     "epoch": "Julian year",
     "false_star_magnitudes": "V",
     "height": "px",
@@ -44,6 +46,7 @@ UNITS: Final = {
     "quiet_s": "1/s",
     "rate_window": "frames",
     "split": "bytes",
+    "star_magnitude_noise": "mag",
     "start_unix_s": "Unix time, s",
     "width": "px",
 }
@@ -317,51 +320,33 @@ def dataclass_rows(kind: Any, skipped: Container[str] = ()) -> list[Row]:
     for field in dataclasses.fields(kind):
         if field.name in skipped:
             continue
-        low, high, *of = field.metadata.get("limits", (None, None))
+        low, high, of = field.metadata.get("limits", (None, None, ""))
         allowed = "" if low is None or high is None or low <= -1e5 else f"{number(low)} to {number(high)}"
         value = "required" if field.default is dataclasses.MISSING else literal(field.default)
-        name, of_field = field.name, of[0] if of else unit(field.name)
+        name, of_field = field.name, of or unit(field.name)
         rows.append((f"`{name}`", of_field, CHOICES.get(name, allowed), value, texts[name]))
     return rows
 
 
 def identifier() -> str:
     """Options of each algorithm, as the emulator accepts them in `[identifier]`."""
-    import importlib
-
-    from starhil.emulator.profile.sections import RunConfig
-    from starid.identification.star_identifier import ALGORITHMS
+    from starid.identification.options import ALGORITHMS
 
     parts = []
-    for algorithm in get_args(RunConfig.model_fields["algorithm"].annotation):
-        module, name = ALGORITHMS[algorithm]
-        solver = getattr(importlib.import_module(module), name)
-        texts = documented_names(solver)
-        for options in get_args(get_type_hints(solver.__init__).get("options")):
-            if dataclasses.is_dataclass(options):
-                for kind in reversed(inspect.getmro(cast("type", options))[:-1]):
-                    texts |= documented_names(kind)
-        rows: list[Row] = [(f"`{name}`", "", "", "", texts[name]) for name in accepted_options(algorithm)]
-        parts.append(f'### With `run.algorithm = "{algorithm}"`\n\n{table(rows)}')
+    for name, algorithm in ALGORITHMS.items():
+        texts: dict[str, str] = {}
+        for kind in reversed(inspect.getmro(algorithm.options)[:-1]):
+            texts |= documented_names(kind)
+        names = sorted(field.name for field in dataclasses.fields(algorithm.options))
+        rows: list[Row] = [(f"`{option}`", "", "", "", texts[option]) for option in names]
+        parts.append(f'### With `run.algorithm = "{name}"`\n\n{table(rows)}')
     return "\n\n".join(parts)
-
-
-def accepted_options(algorithm: str) -> list[str]:
-    """Return the options that the emulator lists when it rejects an unknown one."""
-    from starhil.emulator.errors import EmulatorError
-    from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifierSetup
-    from starid.camera import DEFAULT_CAMERA
-    from starid.catalog import load_catalog
-
-    try:
-        StarIdentifierSetup(algorithm, DEFAULT_CAMERA, 1.0, (("no_option", 1),)).make(load_catalog())
-    except EmulatorError as error:
-        return str(error).partition("known: ")[2].split(", ")
-    raise SystemExit(f"{algorithm}: accepts an option that it does not have")
 
 
 def faults() -> str:
     """Keys of the tables of a `fault` request, except optical faults, whose keys are those of `[sky]`."""
+    from starhil.emulator.device.clock_errors import ClockFault
+    from starhil.emulator.device.telemetry_faults import TelemetryFault
     from starhil.emulator.run.faults import EFFECTS, DeviceFault, WireFault
     from starhil.protocol.unit import load_unit
 
@@ -371,7 +356,9 @@ def faults() -> str:
         allowed = ", ".join(f"`{name}`" for name in enums[effect.enum].values) if effect.enum else row[2]
         rows.append((row[0], row[1], allowed, row[3], row[4]))
     return (
-        f"### `device`\n\n{table(rows)}\n\n### `serial`, `can`\n\n"
+        f"### `device`\n\n{table(rows)}\n\n### `clock`\n\n{table(model_rows(ClockFault))}\n\n### `telemetry`\n\n"
+        "A table, or a list of tables. [FDIR tests](fdir.md) has examples; on CANopen, PDOs and SDO answers are affected.\n\n"
+        f"{table(model_rows(TelemetryFault))}\n\n### `serial`, `can`\n\n"
         f"`can` is what the device sends on the CAN bus, CANopen included.\n\n{table(model_rows(WireFault))}"
     )
 

@@ -77,6 +77,8 @@ FAULTS: tuple[dict[str, Any], ...] = (
 WORST_BYTES = 64_000
 """Size of each message of `--worst`; a datagram has at most 65 507 bytes."""
 WORST_EVERY_S = 0.5
+WORST_ROWS = 50_000
+"""Number of rows of the truth file that the control channel names."""
 WINDOW_POLLS = 100
 WORST_WINDOWS = 4
 """Number of windows with messages for each channel."""
@@ -345,7 +347,8 @@ class Page:
     async def _ask(self, request: dict[str, Any]) -> None:
         await self._pages.send_str(json.dumps({**request, "id": 1}))
         async for message in self._pages:  # ends if the console closes
-            if '"type": "answer"' in str(message.data)[:60]:
+            await self._pages.send_str('{"do": "received"}')
+            if b'"type": "answer"' in message.data:
                 return
 
 
@@ -361,6 +364,9 @@ class Attack:
         host, _, port = self._ready["can"].removeprefix("socketcand:").partition("/")[0].partition(":")
         self._hub = stack.enter_context(socket.create_connection((host, int(port))))
         self._hub.sendall(b"< open vcan0 >")
+        self._file = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-soak-")), "truth.csv")
+        rows = "".join(f"{second},0,0,0,1\n" for second in range(WORST_ROWS))
+        self._file.write_text(f"t,qx,qy,qz,qw\n{rows}", encoding="ascii")
         self.channels: dict[str, Send] = {
             "control": self._to_control,
             "console": self._to_console,
@@ -368,6 +374,10 @@ class Attack:
             "serial": self._to_serial,
             "hub": lambda: self._hub.sendall(b"< send 1234567 8 1 2 3 4 5 6 7 > <" * (WORST_BYTES // 35)),
             "CAN": lambda: self._hub.sendall(b"< send 07030104 8 1 2 3 4 5 6 7 9 >" * (WORST_BYTES // 35)),
+            "NMT": lambda: self._hub.sendall(
+                b"< send 000 2 1 2C >< send 000 2 82 2C >" * (WORST_BYTES // 39)
+            ),
+            "file": lambda: self._control.do("set_truth", truth={"kind": "file", "path": str(self._file)}),
         }
 
     def _next(self, messages: Sequence[Any]) -> Any:
@@ -406,7 +416,7 @@ def worst(wanted: Sequence[str]) -> bool:
             can=hub.ready["can"],
             seed=1,
             settings=[f"links.serial.baud={BAUD}", "truth.kind=live"],
-            extra=["--control", "auto", "--view", "auto"],
+            extra=["--control", "auto", "--view", "auto", "--canopen", "44"],
         )
         emulator = stack.enter_context(EmulatorProcess(command))
         attack = Attack(emulator, stack)

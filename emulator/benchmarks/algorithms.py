@@ -52,16 +52,21 @@ class Scene:
     rate_deg_s: float
     false_stars: int = 0
     missing_stars: int = 0
+    predicted: bool = True
+    """Whether the algorithms are given a prediction while the body turns; otherwise, each image is lost in space."""
 
     @property
     def name(self) -> str:
         """What the table calls it."""
         motion = "lost in space" if self.rate_deg_s == 0.0 else f"{self.rate_deg_s:g} deg/s"
+        if not self.predicted:
+            motion += " without predictions"
         return f"{motion}, {self.false_stars} false, {self.missing_stars} missing"
 
 
-SCENES: Final = tuple(
-    Scene(rate, *stars) for rate in (0.0, 0.3) for stars in ((0, 0), (5, 0), (30, 0), (0, 5))
+SCENES: Final = (
+    *(Scene(rate, *stars) for rate in (0.0, 0.3) for stars in ((0, 0), (5, 0), (30, 0), (0, 5))),
+    Scene(0.3, 6, predicted=False),
 )
 
 
@@ -94,7 +99,7 @@ class Comparison:
         tallies = {name: _Tally(device) for name, device in self.devices.items()}
         for number, (request, found, restarted) in enumerate(self._images(scene)):
             for tally in tallies.values():
-                tally.add(request, found, number, restarted=restarted)
+                tally.add(request, found, number, restarted=restarted, predicted=scene.predicted)
         for name, tally in tallies.items():
             yield {
                 "profile": self.plan.profile,
@@ -134,17 +139,17 @@ class Comparison:
             yield request, _without(found, scene.missing_stars, rng), number % length == 0
 
 
-def _without(found: Detections, missing: int, rng: np.random.Generator) -> Detections:
+def _without(detections: Detections, missing: int, rng: np.random.Generator) -> Detections:
     """The detections without some of the 25 brightest."""
-    brightest = np.argsort(-found.flux)[:25]
+    brightest = np.argsort(-detections.flux)[:25]
     lost = rng.choice(brightest, size=min(missing, brightest.size), replace=False)
-    kept = np.delete(np.arange(found.flux.size), lost)
+    kept = np.delete(np.arange(detections.flux.size), lost)
     columns: dict[str, Any] = {
         name: value[kept]
-        for name, value in vars(found).items()
-        if isinstance(value, np.ndarray) and value.shape[:1] == found.flux.shape
+        for name, value in vars(detections).items()
+        if isinstance(value, np.ndarray) and value.shape[:1] == detections.flux.shape
     }
-    return replace(found, **columns)
+    return replace(detections, **columns)
 
 
 class _Tally:
@@ -159,7 +164,9 @@ class _Tally:
         self._frames = self._triggers = 0
         self._bytes = 0
 
-    def add(self, request: FrameRequest, found: Detections, number: int, *, restarted: bool) -> None:
+    def add(
+        self, request: FrameRequest, detections: Detections, number: int, *, restarted: bool, predicted: bool
+    ) -> None:
         """Identify the detections of an image."""
         pipeline = self._device.pipeline
         identifier: Any = pipeline.identifier(request)
@@ -168,9 +175,9 @@ class _Tally:
             self._last = []
             if hasattr(identifier, "reset"):
                 identifier.reset()
-        predicted = self._predicted(number)
+        expected = self._predicted(number) if predicted else None
         begin = time.thread_time()
-        solution = pipeline.solution(found, replace(request, predicted=predicted))
+        solution = pipeline.solution(detections, replace(request, predicted=expected))
         self._ms.append(1e3 * (time.thread_time() - begin))
         self._frames += 1
         self._triggers += bool(solution.features is not None and solution.features.triggered)

@@ -128,7 +128,7 @@ def _one_frame(renderer: Renderer, rate_deg_s: float, index: int, seed: int) -> 
     return _compare(renderer, frame, found)
 
 
-def _compare(renderer: Renderer, frame: Frame, found: Detections) -> Array:
+def _compare(renderer: Renderer, frame: Frame, detections: Detections) -> Array:
     """Match every isolated star with its detection and its bound."""
     sensor, camera = renderer.sensor, renderer.camera
     truth = frame.stars.xy_px
@@ -150,12 +150,12 @@ def _compare(renderer: Renderer, frame: Frame, found: Detections) -> Array:
             sensor,
             still_e,
         )
-        off = found.xy_px - truth[k]
+        off = detections.xy_px - truth[k]
         distance = np.hypot(off[:, 0], off[:, 1])
-        near = int(np.argmin(distance)) if len(found) else -1
+        near = int(np.argmin(distance)) if len(detections) else -1
         seen = near >= 0 and distance[near] < _MATCH_PX
         error = off[near] if seen else np.full(2, np.nan)
-        predicted = found.xy_sigma_px[near] if seen else np.full(2, np.nan)
+        predicted = detections.xy_sigma_px[near] if seen else np.full(2, np.nan)
         rows.append([float(frame.stars.magnitude[k]), float(seen), *error, *predicted, *bound])
     return np.array(rows, dtype=np.float64).reshape(-1, 8)
 
@@ -164,19 +164,19 @@ def _rows(rate: float, table: Array) -> list[CentroidRow]:
     """Summarise the stars at one rate by magnitude."""
     rows = []
     for low, high in itertools.pairwise(EDGES_V):
-        chosen = table[(table[:, 0] >= low) & (table[:, 0] < high)]
-        seen = chosen[chosen[:, 1] > 0.0]
-        if len(seen) == 0:
+        stars_in_bin = table[(table[:, 0] >= low) & (table[:, 0] < high)]
+        detected = stars_in_bin[stars_in_bin[:, 1] > 0.0]
+        if len(detected) == 0:
             continue
-        error, predicted, bound = seen[:, 2:4], seen[:, 4:6], seen[:, 6:8]
+        error, predicted, bound = detected[:, 2:4], detected[:, 4:6], detected[:, 6:8]
         rms, least = _rms(error), _rms(bound)
         rows.append(
             CentroidRow(
                 rate_deg_s=rate,
                 v_low=low,
                 v_high=high,
-                stars=len(chosen),
-                detected_pct=100.0 * len(seen) / len(chosen),
+                stars=len(stars_in_bin),
+                detected_pct=100.0 * len(detected) / len(stars_in_bin),
                 rms_px=rms,
                 bound_px=least,
                 ratio=rms / least,
@@ -200,14 +200,16 @@ def plot_centroids(rows: Sequence[CentroidRow], path: Path) -> None:
     rates = sorted({row.rate_deg_s for row in rows})
     plot, panels = figure(1, len(rates), width=3.4 * len(rates) + 0.8, sharey=True, squeeze=False)
     for panel, rate in zip(panels[0], rates, strict=True):
-        chosen = [row for row in rows if row.rate_deg_s == rate]
-        middle = [0.5 * (max(row.v_low, _BRIGHTEST_COMPLETE) + row.v_high) for row in chosen]
+        at_rate = [row for row in rows if row.rate_deg_s == rate]
+        middle = [0.5 * (max(row.v_low, _BRIGHTEST_COMPLETE) + row.v_high) for row in at_rate]
         for name, style, size, label in (
             ("bound_px", "k-", 0, "Cramér–Rao bound"),
             ("rms_px", "o", 6, "measured error"),
             ("predicted_px", "_", 14, "error stated"),
         ):
-            panel.semilogy(middle, [getattr(row, name) for row in chosen], style, ms=size, mew=2, label=label)
+            panel.semilogy(
+                middle, [getattr(row, name) for row in at_rate], style, ms=size, mew=2, label=label
+            )
         panel.set_title(f"{rate:g} °/s")
         panel.set_xlabel("V magnitude")
     panels[0, 0].set_ylabel("error per axis, px (root mean square)")

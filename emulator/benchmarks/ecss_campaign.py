@@ -121,7 +121,7 @@ class Condition:
 
 
 @dataclass
-class _Shot:
+class _FrameConditions:
     """The conditions of one frame."""
 
     attitude: Attitude
@@ -161,105 +161,123 @@ class EcssDevice:
         self.mean_c = thermal.mounting_c + thermal.heating_c_w * self.power_w
         self.swing_c = thermal.swing_c
 
-    def solve(self, condition: Condition, number: int) -> tuple[_Shot, FrameResult]:
+    def solve(self, condition: Condition, number: int) -> tuple[_FrameConditions, FrameResult]:
         """Render and solve a frame under a condition; return its conditions and the result."""
         rng = np.random.default_rng((self.plan.seed, condition.stream, number))
-        shot = _SHOTS[condition.influence](self, condition, number, rng)
+        frame = _CONDITIONS[condition.influence](self, condition, number, rng)
         temperature_c = self.mean_c
-        if shot.point is not None:
-            temperature_c += self.swing_c * math.sin(2.0 * math.pi * shot.point)
+        if frame.point is not None:
+            temperature_c += self.swing_c * math.sin(2.0 * math.pi * frame.point)
         request = FrameRequest(
             index=condition.stream * 1_000_000 + number,
-            truth=TruthState(shot.attitude, shot.rate_rad_s),
+            truth=TruthState(frame.attitude, frame.rate_rad_s),
             exposure_s=self.exposure_s,
             gain=self.gain,
             settings=self.settings,
-            faults=shot.sky,
+            faults=frame.sky,
             temperature_c=temperature_c,
-            particles_s=shot.particles_s,
+            particles_s=frame.particles_s,
         )
-        if shot.unix_s is not None:
-            truth = request.truth.completed(shot.unix_s, self.orbit)
-            assumed = observer_velocity(self.parameters, shot.unix_s)  # by the device
+        if frame.unix_s is not None:
+            truth = request.truth.completed(frame.unix_s, self.orbit)
+            assumed = observer_velocity(self.parameters, frame.unix_s)  # by the device
             request = replace(request, truth=truth, observer_velocity=assumed)
         result = self.pipeline.handle(request)
         if not isinstance(result, FrameResult):
             raise EmulatorError(f"campaign: profile {self.plan.profile}: {getattr(result, 'text', result)}")
-        return shot, result
+        return frame, result
 
     def field_attitude(self, condition: Condition, number: int) -> Attitude:
         """Return the attitude of a field, the same for all its frames."""
         return random_attitude(np.random.default_rng((self.plan.seed, condition.stream, number, 1)))
 
 
-def _at_rest(device: EcssDevice, condition: Condition, _number: int, rng: np.random.Generator) -> _Shot:
+def _at_rest(
+    device: EcssDevice, condition: Condition, _number: int, rng: np.random.Generator
+) -> _FrameConditions:
     del device, condition
-    return _Shot(random_attitude(rng), np.zeros(3), float(rng.uniform()))
+    return _FrameConditions(random_attitude(rng), np.zeros(3), float(rng.uniform()))
 
 
-def _static(device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator) -> _Shot:
+def _static(
+    device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator
+) -> _FrameConditions:
     plan = device.plan
     position, _ = divmod(number, plan.repeats)
     field_number, condition_number = divmod(position, plan.positions)
     chosen = np.random.default_rng((plan.seed, condition.stream, position, 2))
     shift = chosen.uniform(-0.5, 0.5, 2) * device.pipeline.camera.pixel_scale_rad
     attitude = device.field_attitude(condition, field_number).rotated((*shift, 0.0))
-    return _Shot(attitude, np.zeros(3), None, {}, 0.0, None, field_number, condition_number)
+    return _FrameConditions(attitude, np.zeros(3), None, {}, 0.0, None, field_number, condition_number)
 
 
-def _thermal(device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator) -> _Shot:
+def _thermal(
+    device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator
+) -> _FrameConditions:
     field_number, point = divmod(number, device.plan.thermal_points)
     attitude = device.field_attitude(condition, field_number)
-    return _Shot(
+    return _FrameConditions(
         attitude, np.zeros(3), point / device.plan.thermal_points, {}, 0.0, None, field_number, point
     )
 
 
-def _on_a_date(device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator) -> _Shot:
+def _on_a_date(
+    device: EcssDevice, condition: Condition, number: int, _rng: np.random.Generator
+) -> _FrameConditions:
     plan = device.plan
     seen, _ = divmod(number, plan.dated_repeats)
     field_number, date = divmod(seen, plan.dates)
     attitude = device.field_attitude(condition, field_number)
     unix_s = device.start_unix_s + YEAR_S * date / plan.dates
-    return _Shot(attitude, np.zeros(3), None, {}, 0.0, unix_s, field_number, date)
+    return _FrameConditions(attitude, np.zeros(3), None, {}, 0.0, unix_s, field_number, date)
 
 
-def _turning(_device: EcssDevice, condition: Condition, _number: int, rng: np.random.Generator) -> _Shot:
+def _turning(
+    _device: EcssDevice, condition: Condition, _number: int, rng: np.random.Generator
+) -> _FrameConditions:
     attitude, axis = random_attitude(rng), rng.normal(size=3)
     rate = np.radians(condition.value) * axis / np.linalg.norm(axis)
-    return _Shot(attitude, rate, float(rng.uniform()))
+    return _FrameConditions(attitude, rate, float(rng.uniform()))
 
 
-def _near(body: str) -> Callable[[EcssDevice, Condition, int, np.random.Generator], _Shot]:
-    def near(device: EcssDevice, condition: Condition, number: int, rng: np.random.Generator) -> _Shot:
-        shot = _at_rest(device, condition, number, rng)
+def _near(body: str) -> Callable[[EcssDevice, Condition, int, np.random.Generator], _FrameConditions]:
+    def near(
+        device: EcssDevice, condition: Condition, number: int, rng: np.random.Generator
+    ) -> _FrameConditions:
+        frame = _at_rest(device, condition, number, rng)
         away_deg = condition.value + (EARTH_RADIUS_DEG if body == "earth" else 0.0)
-        ra_deg, dec_deg = direction_around(shot.attitude, (away_deg, away_deg), rng)
-        shot.sky = {body: {"ra_deg": ra_deg, "dec_deg": dec_deg}}
+        ra_deg, dec_deg = direction_around(frame.attitude, (away_deg, away_deg), rng)
+        frame.sky = {body: {"ra_deg": ra_deg, "dec_deg": dec_deg}}
         if body == "earth":
-            shot.sky[body]["radius_deg"] = EARTH_RADIUS_DEG
-        return shot
+            frame.sky[body]["radius_deg"] = EARTH_RADIUS_DEG
+        return frame
 
     return near
 
 
-def _false_stars(device: EcssDevice, condition: Condition, number: int, rng: np.random.Generator) -> _Shot:
-    shot = _at_rest(device, condition, number, rng)
+def _false_stars(
+    device: EcssDevice, condition: Condition, number: int, rng: np.random.Generator
+) -> _FrameConditions:
+    frame = _at_rest(device, condition, number, rng)
     faintest = device.settings.limiting_magnitude
-    shot.sky = {
+    frame.sky = {
         "false_stars": int(condition.value),
         "false_star_magnitudes": [min(1.0, faintest), faintest],
     }
-    return shot
+    return frame
 
 
-def _particles(device: EcssDevice, condition: Condition, number: int, rng: np.random.Generator) -> _Shot:
-    shot = _at_rest(device, condition, number, rng)
-    shot.particles_s = condition.value
-    return shot
+def _particles(
+    device: EcssDevice, condition: Condition, number: int, rng: np.random.Generator
+) -> _FrameConditions:
+    frame = _at_rest(device, condition, number, rng)
+    frame.particles_s = condition.value
+    return frame
 
 
-_SHOTS: Final[dict[str, Callable[[EcssDevice, Condition, int, np.random.Generator], _Shot]]] = {
+_CONDITIONS: Final[
+    dict[str, Callable[[EcssDevice, Condition, int, np.random.Generator], _FrameConditions]]
+] = {
     STATIC: _static,
     THERMAL: _thermal,
     DATED: _on_a_date,
@@ -287,17 +305,17 @@ def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
     labels = np.zeros((len(numbers), 3), dtype=np.int64)
     to_sensor = np.zeros((len(numbers), 3, 3))
     for row, number in enumerate(numbers):
-        shot, result = device.solve(condition, number)
-        labels[row] = shot.field_number, shot.condition_number, result.detected
-        to_sensor[row] = shot.attitude.matrix
+        frame, result = device.solve(condition, number)
+        labels[row] = frame.field_number, frame.condition_number, result.detected
+        to_sensor[row] = frame.attitude.matrix
         outcome[row] = result.reason
         if not result.valid:
             continue
-        error = Attitude(np.array(result.quaternion_xyzw)).error_to(shot.attitude)
+        error = Attitude(np.array(result.quaternion_xyzw)).error_to(frame.attitude)
         errors[row] = error.rotation_vector_rad * ARCSEC_PER_RAD
         stated[row] = result.sigma_cross_arcsec, result.sigma_roll_arcsec
         too_far = max(error.cross_boresight_arcsec, error.roll_arcsec) > 3600.0 * WRONG_DEG
-        rate_deg_s = round(float(np.degrees(np.linalg.norm(shot.rate_rad_s))), _RATE_DIGITS)
+        rate_deg_s = round(float(np.degrees(np.linalg.norm(frame.rate_rad_s))), _RATE_DIGITS)
         if rate_deg_s > device.max_rate_deg_s:
             outcome[row] = "rate_too_high"
         else:

@@ -157,8 +157,8 @@ def make_report(plan: EcssPlan, parts: Iterable[tuple[str, int, Results]], confi
     static = _series(joined[STATIC])
     rest = joined[REST]
     valid = ~np.isnan(rest["error_arcsec"]).any(axis=1)
-    found, stated = np.abs(rest["error_arcsec"][valid]), rest["stated_arcsec"][valid]
-    measured = np.quantile(found, confidence, axis=0) if len(found) else np.full(3, np.nan)
+    errors, stated = np.abs(rest["error_arcsec"][valid]), rest["stated_arcsec"][valid]
+    measured = np.quantile(errors, confidence, axis=0) if len(errors) else np.full(3, np.nan)
     return EcssReport(
         plan,
         confidence,
@@ -176,8 +176,8 @@ def make_report(plan: EcssPlan, parts: Iterable[tuple[str, int, Results]], confi
         ),
         float(np.median(rest["labels"][:, 2])),
         (
-            Stated.of("across the boresight", found[:, :2], stated[:, 0]),
-            Stated.of("about the boresight", found[:, 2:], stated[:, 1]),
+            Stated.of("across the boresight", errors[:, :2], stated[:, 0]),
+            Stated.of("about the boresight", errors[:, 2:], stated[:, 1]),
         ),
     )
 
@@ -312,12 +312,12 @@ def _plot_availability(report: EcssReport, folder: Path) -> Path:
 
     fig, axes = figure(2, 3, width=9.0, height=5.0, sharey=True)
     for axis, (name, (what, unit, _)) in zip(axes.flat, INFLUENCES.items(), strict=True):
-        found = [outcome for outcome in report.outcomes if outcome.influence == name]
-        values = [outcome.value for outcome in found]
+        outcomes = [outcome for outcome in report.outcomes if outcome.influence == name]
+        values = [outcome.value for outcome in outcomes]
         axis.plot(
-            values, [100 * outcome.correct / outcome.frames for outcome in found], "o-", label="correct"
+            values, [100 * outcome.correct / outcome.frames for outcome in outcomes], "o-", label="correct"
         )
-        axis.plot(values, [100 * outcome.wrong / outcome.frames for outcome in found], "x-", label="wrong")
+        axis.plot(values, [100 * outcome.wrong / outcome.frames for outcome in outcomes], "x-", label="wrong")
         axis.set_xlabel(f"{what}, {unit}" if unit else what)
         axis.set_ylim(-3, 103)
         if max(values) > 20.0 * max(min(value for value in values if value > 0.0), 1e-9):

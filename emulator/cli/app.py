@@ -21,12 +21,6 @@ _NAMES: Final = (
 COMMANDS: Final = {name: f"starhil.emulator.cli.{name}" for name in _NAMES.split()}
 """Sub-command → module."""
 
-MOVED: Final[dict[tuple[str, ...], str]] = {
-    **{(name,): name for name in ("identify", "calibrate", "catalog", "features", "database", "reproduce")},
-    ("bench", "identify"): "bench",
-}
-"""Sub-commands of earlier releases → their names in `starid`; they go on working for one release."""
-
 
 def build_app(words: Sequence[str] = ()) -> typer.Typer:
     """Assemble the command line, see `command_line.build_app`."""
@@ -35,12 +29,7 @@ def build_app(words: Sequence[str] = ()) -> typer.Typer:
 
 
 def main() -> None:
-    """Run the command line; a sub-command that has moved to `starid` is run there."""
-    words = sys.argv[1:]
-    for old, new in MOVED.items():
-        if tuple(words[: len(old)]) == old:
-            from starid.cli import app
-
-            print(f"starhil {' '.join(old)}: is now starid {new}", file=sys.stderr)
-            app.main([new, *words[len(old) :]])
-    command_line.run("starhil", build_app, words, (StaridError, ProtocolError, EmulatorError, BenchError))
+    """Run the command line."""
+    command_line.run(
+        "starhil", build_app, sys.argv[1:], (StaridError, ProtocolError, EmulatorError, BenchError)
+    )

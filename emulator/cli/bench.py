@@ -117,7 +117,7 @@ def centroid(
     if output is not None:
         prepare_output(output, "-o")
         import_module("matplotlib")  # before the work
-    sensor = SensorModel(bits=bits)
+    sensor = SensorModel().with_(bits=bits)
     rows = measure_centroids(rates or DEFAULT_RATES_DEG_S, frames, seed, sensor, progress=progress())
     if output is not None:
         plot_centroids(rows, output)

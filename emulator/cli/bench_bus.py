@@ -44,7 +44,6 @@ REQUIRED_ROWS = (
     "set_update_rate",
     "set_mode",
 )
-"""Rows that the load requests."""
 
 
 def check_rows(icd: InterfaceDefinition) -> None:

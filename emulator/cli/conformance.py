@@ -21,12 +21,10 @@ if TYPE_CHECKING:
     from starhil.protocol.icd import InterfaceDefinition
 
 
-def links_of(icd: InterfaceDefinition, node: int | None) -> tuple[str | None, str | None, int | None]:
-    """Return serial port, CAN channel and CANopen node of a unit; the node if given or the only link."""
+def links_of(icd: InterfaceDefinition, node: int | None) -> tuple[str | None, str | None]:
+    """Return serial port and CAN channel of a unit, with a CANopen node or without."""
     serial = None if icd.link.serial is None else "auto"
-    if icd.canopen_only and node is None:
-        node = int(icd.parameters["canopen_node"].default)
-    return serial, None if icd.link.can is None and node is None else "auto", node
+    return serial, None if icd.link.can is None and node is None else "auto"
 
 
 @dataclass(frozen=True)
@@ -75,18 +73,23 @@ class CaseOptions:
         from starhil.hil_tests.conformance.conformance_run import ConformanceRequest
         from starhil.hil_tests.conformance.link_probe import ProbeTimes
         from starhil.hil_tests.errors import BenchError
+        from starhil.hil_tests.rig.rig import OFF, links_to_use
         from starhil.protocol.unit import load_unit
 
-        serial, can, canopen = bench.serial, bench.can, self.canopen
-        if (bench.start or list_only) and serial is None and can is None:
-            serial, can, canopen = links_of(load_unit(bench.unit or DEFAULT_UNIT), canopen)
+        icd, canopen = load_unit(bench.unit or DEFAULT_UNIT), self.canopen
+        if canopen is None and icd.canopen_only and bench.can != OFF:
+            canopen = int(icd.parameters["canopen_node"].default)
+        everything = links_of(icd, canopen) if bench.start or list_only else (None, None)
+        serial, can = links_to_use(bench.serial, bench.can, everything)
+        if serial is None and can is None:
+            raise BenchError("no link: use --serial DEV, --can CHANNEL, --canopen NODE, or --start")
         settings = with_orbit(self.settings, self.orbit)
         if settings and not bench.start:
             option = "--set" if self.orbit is None else "--orbit"
             raise BenchError(f"{option} needs --start: it overrides a key of the emulator's profile")
         if self.truth is not None and bench.start:
             raise BenchError("--truth is for a unit that runs already; with --start the truth is known")
-        if canopen is not None and can is None:
+        if self.canopen is not None and can is None:
             raise BenchError("--canopen needs --can: give the channel of the node")
         if not bench.start and not list_only and serial == "auto":
             raise BenchError("--serial auto needs --start; otherwise name the port")

@@ -57,12 +57,12 @@ def command(
     ] = None,
 ) -> None:
     """Print a page of the documentation, in Markdown, or list the pages."""
-    found = pages()
+    texts = pages()
     if page is None:
-        for name, text in found.items():
+        for name, text in texts.items():
             print(f"{name:<18}  {text.splitlines()[0].removeprefix(_HEADING)}")
         return
     name = page.removeprefix("docs/").partition("#")[0].removesuffix(".md")
-    if name not in found:
-        raise EmulatorError(f"page {page!r}: not found{remedy(name, found)}")
-    print_text(_DIRECTIVES.sub(_with_docstrings, found[name]))
+    if name not in texts:
+        raise EmulatorError(f"page {page!r}: not found{remedy(name, texts)}")
+    print_text(_DIRECTIVES.sub(_with_docstrings, texts[name]))

@@ -225,7 +225,7 @@ def run_once(life: Any, *, record: Path | None = None) -> Any:
 
 def write_life(life: Any, violation: str, folder: Path) -> list[Path]:
     """Write a life as JSON, as a session, and as the recording of its last time under power, if that can be repeated."""
-    from starhil.hil_tests.endurance.life import UNRECORDED
+    from starhil.hil_tests.endurance.life import UNRECORDED_STEPS
     from starhil.hil_tests.endurance.violating_life import session_of
     from starhil.hil_tests.judge.definition import read_unit
 
@@ -233,7 +233,7 @@ def write_life(life: Any, violation: str, folder: Path) -> list[Path]:
     file, session, recording = folder / f"{name}.json", folder / f"{name}.toml", folder / f"{name}-recording"
     _write(file, json.dumps({**asdict(life), "violation": violation}, indent=1) + "\n")
     _write(session, session_of(life, read_unit(life.unit), violation))
-    if UNRECORDED & {step["do"] for step in life.steps}:
+    if UNRECORDED_STEPS & {step["do"] for step in life.steps}:
         return [file, session]
     run_once(life, record=recording)
     return [file, session, recording]

@@ -77,7 +77,6 @@ def export(
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a file atomically."""
     from starid.storage.files import write_atomically
 
     with writing(path):

@@ -103,11 +103,13 @@ class BenchOptions:
 
     unit: UnitChoice = None
     serial: Annotated[
-        str | None, typer.Option(help="Serial port: /dev/…, socket://HOST:PORT, or auto with --start.")
+        str | None, typer.Option(help="Serial port: /dev/…, socket://HOST:PORT, auto with --start, or off.")
     ] = None
     can: Annotated[
         str | None,
-        typer.Option(help="CAN channel: vcan0, socketcand:127.0.0.1:29536/vcan0, …, or auto with --start."),
+        typer.Option(
+            help="CAN channel: vcan0, socketcand:127.0.0.1:29536/vcan0, …, auto with --start, or off."
+        ),
     ] = None
     dialect: SerialDialect = None
     host_address: Annotated[int, typer.Option(help="CAN address of the OBC.")] = 1

@@ -18,7 +18,7 @@ def command(
     profile: Annotated[
         str | None,
         typer.Option(
-            help="Device profile, a name or a TOML file, instead of the one in the recording; `[links]` and `[run]`, except its "
+            help="Device profile, a name or a TOML file, instead of the one in the recording; its tables `links` and `run`, except the "
             "algorithm, stay as recorded.",
             autocompletion=names_of("profile"),
         ),

@@ -181,6 +181,14 @@ class AroundOptions:
             "command. It is the same in the next run, so that such pages reconnect.",
         ),
     ] = None
+    command_token: Annotated[
+        str | None,
+        typer.Option(
+            envvar="STARHIL_COMMAND_TOKEN",
+            help="Token of the console's address (`view`), the same in the next run, so that its pages reconnect; default: "
+            "a random one.",
+        ),
+    ] = None
     record: Annotated[
         list[Path] | None,
         typer.Option(
@@ -196,11 +204,15 @@ class AroundOptions:
         from starhil.emulator.control.token import check_token
         from starhil.emulator.launch import ConsoleOptions, RunOptions
 
-        for option, token in (("--control-token", self.control_token), ("--view-token", self.view_token)):
+        of_console = {"--view-token": self.view_token, "--command-token": self.command_token}
+        for option, token in {"--control-token": self.control_token, **of_console}.items():
             if token is not None:
                 check_token(option, token)
-        if self.view_token is not None and self.view == "off":
-            raise EmulatorError("--view-token: needs --view")
+        for option, token in of_console.items():
+            if token is not None and self.view == "off":
+                raise EmulatorError(f"{option}: needs --view")
+        if self.view_token is not None and self.view_token == self.command_token:
+            raise EmulatorError("--view-token: must differ from --command-token")
         records = _by_format(self.record or ())
         folder = records.pop("", None)
         files = tuple(records.values())
@@ -218,7 +230,9 @@ class AroundOptions:
             record=folder,
             console=None
             if self.view == "off" and not files
-            else ConsoleOptions(ConsoleClient, self.view, self.view_token or "", files),
+            else ConsoleOptions(
+                ConsoleClient, self.view, self.view_token or "", self.command_token or "", files
+            ),
         )
 
 
@@ -282,7 +296,9 @@ async def _serve(make: Callable[[], Emulator]) -> int:
     import gc
 
     from starhil.emulator.simulation.guard import log_loop_errors_once
+    from starhil.emulator.simulation.threads import share_interpreter
 
+    share_interpreter()
     emulator = make()
     loop = asyncio.get_running_loop()
     log_loop_errors_once(loop)
@@ -312,18 +328,17 @@ async def _serve(make: Callable[[], Emulator]) -> int:
 
 def _by_format(paths: Sequence[Path]) -> dict[str, Path]:
     """Return the files of `--record` by suffix, and the folder by the empty suffix."""
-    found: dict[str, Path] = {}
+    by_suffix: dict[str, Path] = {}
     for path in paths:
         suffix = path.suffix if path.suffix in RECORDERS else ""
-        other = found.setdefault(suffix, path)
+        other = by_suffix.setdefault(suffix, path)
         if other is not path:
             kind = f"{suffix[1:].upper()} file" if suffix else "folder"
             raise EmulatorError(f"--record {path}: one {kind} per run, and {other} is one already")
-    return found
+    return by_suffix
 
 
 def _as_toml(value: str | float) -> str:
-    """Write a value as TOML."""
     if isinstance(value, (int, float)):
         return str(value)
     return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -20,7 +20,7 @@ group = typer.Typer(
     no_args_is_help=True,
 )
 
-_ROW_KEYS = ("kind", "klass", "id", "name", "size", "action", "provenance")
+_ROW_KEYS = ("kind", "message_class", "id", "name", "size", "action", "provenance")
 _FIELD_KEYS = ("name", "offset", "type", "unit", "value", "argument", "parameter", "const")
 
 UnitArgument = Annotated[
@@ -152,9 +152,9 @@ def describe(unit: UnitArgument = DEFAULT_UNIT, as_json: AsJson = False) -> None
         code = "none" if item.code is None else str(item.code)
         print(f"class {item.name}: {item.kind.value}, code {code}")
     for row in icd.rows:
-        klass = f"{row.klass} " if row.klass else ""
+        message_class = f"{row.message_class} " if row.message_class else ""
         action = "" if row.action is None else f", action {row.action}"
-        print(f"{klass}{row.id} {row.kind} {row.name}: {row.size} B{action}, {row.provenance}")
+        print(f"{message_class}{row.id} {row.kind} {row.name}: {row.size} B{action}, {row.provenance}")
         for field in row.named_fields.values():
             unit_text = f" {field.unit}" if field.unit else ""
             print(f"    {field.offset:4d} {field.name}: {field.type}{unit_text}{_binding(field)}")
@@ -192,6 +192,6 @@ def _summary(icd: Any) -> dict[str, Any]:
 
 
 def _row(row: Any) -> dict[str, Any]:
-    named = {"class" if key == "klass" else key: getattr(row, key) for key in _ROW_KEYS}
+    named = {"class" if key == "message_class" else key: getattr(row, key) for key in _ROW_KEYS}
     fields = [{key: getattr(field, key) for key in _FIELD_KEYS} for field in row.named_fields.values()]
     return {**named, "fields": fields}

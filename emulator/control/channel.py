@@ -19,8 +19,9 @@ import json
 import logging
 from collections import deque
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, get_args
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -28,22 +29,24 @@ from pydantic import BaseModel, ValidationError
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.control.token import is_token
+from starhil.emulator.device.cycle import Phase
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.run import Run
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.run.head import Head
-from starhil.emulator.run.tape import ClearedFaults, NewFaults
+from starhil.emulator.run.tape import AwaitedPhase, ClearedFaults, NewFaults
 from starhil.emulator.run.truth_log import compare
 from starhil.emulator.sensor.pipeline.messages import as_quaternion
 from starhil.emulator.simulation.guard import until_cancelled
+from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.json_lines import JsonError, parse_object, read_lines
 from starhil.emulator.truth.live import LiveTruth
 from starhil.protocol.errors import ProtocolError, did_you_mean, remedy
 from starhil.protocol.files.validation import problems
 from starhil.protocol.icd.conventions import NANOSECONDS
-from starhil.protocol.transports.connections import ConnectionLimit
+from starhil.protocol.transports.connections import ConnectionLimit, detect_lost_peer
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
@@ -51,17 +54,24 @@ log = logging.getLogger("starhil.control")
 MAX_LINE: Final = 1 << 16
 """Longest request, bytes."""
 
-EXAMINED: Final = 200
+EXAMINED_ERRORS: Final = 200
 """Number of errors of a request that are examined; of further ones the answer gives the number."""
 
 KEPT_FRAMES: Final = 200
-BUSY: Final = b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
+PHASE_WITHIN_S: Final = 30.0
+"""Longest wait for a phase of an exposure, unless a request gives another one, simulation time, seconds."""
+SHORTEST_WAIT_S: Final = 1e-4
+BUSY_ANSWER: Final = (
+    b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
+)
 
 REQUEST_S: Final = 10.0
 """Time within which a peer of the control channel or of the console must complete a request: a line, after its first
 byte; for HTTP, after it has connected or received the last response, and the body after the headers; seconds."""
 
-LATE: Final = json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
+LATE_ANSWER: Final = (
+    json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
+)
 
 Answer = dict[str, Any]
 Action = Callable[[Head, dict[str, Any]], Awaitable[Answer]]
@@ -80,14 +90,16 @@ class ControlServer:
         self._opening = asyncio.Lock()
         self._quit = quit_run
         self._server: asyncio.Server | None = None
-        self._writers: set[asyncio.StreamWriter] = set()
-        self._limit = ConnectionLimit("control channel", BUSY)
+        self._peers: dict[asyncio.StreamWriter, bool] = {}
+        """Connections, the oldest first, and whether one of their requests was accepted."""
+        self._limit = ConnectionLimit("control channel", BUSY_ANSWER)
         self._actions: dict[str, tuple[Action, tuple[str, ...] | None]] = {
             "status": (self._status, ()),
             "truth": (self._truth, ("run_time_s", "unix_s")),
             "frames": (self._last_frames, ("count",)),
             "set_truth": (self._set_truth, ("truth",)),
             "step": (self._step, ("seconds",)),
+            "wait": (self._wait, ("seconds", "phase", "within_s")),
             "fault": (self._fault, None),
             "clear_faults": (self._clear_faults, ()),
             "scenario": (self._run_scenario, ("name",)),
@@ -124,24 +136,37 @@ class ControlServer:
             self._server.close()
         if self._socket is not None:
             self._socket.close()
-        for writer in list(self._writers):
+        for writer in list(self._peers):
             writer.transport.abort()
 
     async def _serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if not self._limit.admits(writer.transport, len(self._writers)):
+        self._make_room()
+        if not self._limit.admits(writer.transport, len(self._peers)):
             return
-        self._writers.add(writer)
+        self._peers[writer] = False
+        if self._socket is None:
+            detect_lost_peer(writer.transport, must_read=True)
         try:
             async for line in read_lines(reader, MAX_LINE, within_s=REQUEST_S):
-                writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
+                answer = await self.answer(line)
+                if writer in self._peers:
+                    self._peers[writer] |= answer["ok"]
+                writer.write(json.dumps(answer).encode() + b"\n")
                 await writer.drain()
         except ConnectionError as error:
             log.info("control channel: connection lost (%s)", error)
         except TimeoutError:
-            writer.write(LATE)
+            writer.write(LATE_ANSWER)
         finally:
-            self._writers.discard(writer)
+            self._peers.pop(writer, None)
             writer.close()
+
+    def _make_room(self) -> None:
+        """Close the oldest connection that has not shown the token, if all places are taken and there is one."""
+        stranger = next((peer for peer, accepted in self._peers.items() if not accepted), None)
+        if self._token and stranger is not None and len(self._peers) >= self._limit.size:
+            del self._peers[stranger]
+            stranger.transport.abort()
 
     async def answer(self, line: bytes | str | None) -> Answer:
         """Execute one request and return its answer; None stands for a line that was too long."""
@@ -163,26 +188,25 @@ class ControlServer:
 
     async def execute(self, request: dict[str, Any]) -> Answer:
         """Execute a decoded request, without `id` and `token`, and return its answer."""
-        wanted = str(request.pop("do", ""))
-        if wanted not in self._actions:
-            near = did_you_mean(wanted, self._actions)
+        action_name = str(request.pop("do", ""))
+        if action_name not in self._actions:
+            near = did_you_mean(action_name, self._actions)
             return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}{near}"}
-        action, known = self._actions[wanted]
+        action, keys = self._actions[action_name]
         try:
             head = self._head(request)
-            if known is not None:
-                _check_keys(request, known)
+            if keys is not None:
+                _check_keys(request, keys)
             self._run.wiring.latch()
             return {"ok": True, **await action(head, request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {"ok": False, "error": str(error)}
         except Exception as error:  # an internal error ends neither the run nor the connection
-            log.exception("control channel: %s", wanted)
+            log.exception("control channel: %s", action_name)
             name = type(error).__name__
             return {"ok": False, "error": f"internal error: {name}; see the emulator's log"}
 
     def _head(self, request: dict[str, Any]) -> Head:
-        """Return the head that a request selects."""
         number, heads = request.pop("head", 1), self._run.heads
         if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= len(heads):
             raise EmulatorError(f"head: must be 1 to {len(heads)}, not {number!r}")
@@ -229,7 +253,7 @@ class ControlServer:
         if "run_time_s" in request:
             run_ns = round(_number(request, "run_time_s") * NANOSECONDS)
         elif "unix_s" in request:
-            run_ns = round(_number(request, "unix_s") * NANOSECONDS) - device.time.offset_ns
+            run_ns = device.time.run_ns(round(_number(request, "unix_s") * NANOSECONDS))
         state = device.surroundings.truth.state(run_ns / NANOSECONDS)
         return {
             "run_time_s": run_ns / NANOSECONDS,
@@ -265,9 +289,45 @@ class ControlServer:
         await stepper.step(_number(request, "seconds"))
         return {"run_time_s": clock.now_ns() / NANOSECONDS}
 
+    async def _wait(self, head: Head, request: dict[str, Any]) -> Answer:
+        clock = self._run.clock
+        if ("seconds" in request) == ("phase" in request):
+            raise EmulatorError("wait: give seconds or phase")
+        if "phase" in request:
+            await self._wait_for_phase(head, request)
+        elif self._run.stepper is not None:
+            raise EmulatorError("wait: time passes only by step on this clock; use step")
+        else:
+            until_ns = clock.running.now_ns() + round(_number(request, "seconds") * NANOSECONDS)
+            while (left_ns := until_ns - clock.running.now_ns()) > 0:
+                await asyncio.sleep(max(left_ns / NANOSECONDS / clock.speed, SHORTEST_WAIT_S))
+            self._run.wiring.latch()
+        return {"run_time_s": clock.now_ns() / NANOSECONDS}
+
+    async def _wait_for_phase(self, head: Head, request: dict[str, Any]) -> None:
+        """Wait for a phase of the next exposure; the stepped clock is advanced to it."""
+        phase, within_s = request["phase"], _number(request, "within_s", PHASE_WITHIN_S)
+        if phase not in (phases := get_args(Phase)):
+            raise EmulatorError(
+                f"phase: must be one of {', '.join(phases)}{did_you_mean(str(phase), phases)}"
+            )
+        reached = asyncio.Event()
+        self._run.wiring.enter(AwaitedPhase, phase=phase)
+        head.device.cycle.at_phase(phase, lambda _due_ns: reached.set())
+        if self._run.stepper is not None:
+            await self._run.stepper.step(within_s, reached.is_set)
+        else:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(reached.wait(), within_s / self._run.clock.speed)
+        if not reached.is_set():
+            mode = head.device.modes.mode.value
+            raise EmulatorError(f"wait: no exposure has begun within {within_s:g} s (mode {mode})")
+
     async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
         wanted = await _parse(FaultRequest, request)
         head.faults.check(wanted)
+        if wanted.optical is not None:
+            await head.prepare_sky(wanted.optical)
         self._run.wiring.enter(NewFaults, request=wanted)
         head.faults.inject(wanted)
         return {"faults": head.faults.describe()}
@@ -281,7 +341,11 @@ class ControlServer:
         if self._run.wiring.records:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         name, start_s = str(request.get("name", "")), self._run.clock.now_ns() / NANOSECONDS
-        events = await asyncio.to_thread(lambda: load_scenario(name).prepare(head, self._run.truth, start_s))
+        async with self._opening:
+            scenario = await in_thread(lambda: load_scenario(name))
+            events = await in_thread(lambda: scenario.prepare(head, self._run.truth, start_s))
+        for sky in scenario.skies:
+            await head.prepare_sky(sky)
         head.device.scheduler.add(events)
         return {"events": len(events)}
 
@@ -291,8 +355,6 @@ class ControlServer:
 
 
 class _Truth(BaseModel):
-    """Arguments of `set_truth`."""
-
     truth: TruthConfig
 
 
@@ -303,9 +365,9 @@ async def _parse(model: type[Model], value: object) -> Model:
         try:
             return model.model_validate_json(json.dumps(value))
         except ValidationError as error:
-            raise EmulatorError(*map(str, problems(error, model, value, most=EXAMINED))) from None
+            raise EmulatorError(*map(str, problems(error, model, value, most=EXAMINED_ERRORS))) from None
 
-    return await asyncio.to_thread(parse)
+    return await in_thread(parse)
 
 
 def _check_keys(request: dict[str, Any], known: tuple[str, ...]) -> None:

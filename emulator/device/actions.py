@@ -111,14 +111,14 @@ def set_mode(device: Device, arguments: Arguments) -> None:
 
 def set_parameter(device: Device, arguments: Arguments) -> None:
     """Set one parameter and select it."""
-    chosen = device.icd.parameters_by_id.get(int(arguments["parameter"]))
-    if chosen is None:
+    parameter = device.icd.parameters_by_id.get(int(arguments["parameter"]))
+    if parameter is None:
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="parameter")
     try:
-        device.parameters.set({chosen.name: arguments["value"]})
+        device.parameters.set({parameter.name: arguments["value"]})
     except MessageError:
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="value") from None
-    device.selected_parameter = chosen.id
+    device.selected_parameter = parameter.id
 
 
 def select_parameter(device: Device, arguments: Arguments) -> None:
@@ -152,15 +152,15 @@ def clear_counters(device: Device, _arguments: Arguments) -> None:
 def subscribe(device: Device, arguments: Arguments) -> None:
     """Send telemetry rows unsolicited; the list replaces the previous one."""
     rate_hz = float(arguments["rate"])
-    wanted = []
+    subscriptions = []
     for name, row_id in arguments.items():
         if not name.startswith("telemetry[") or not row_id:
             continue
         row = device.icd.telemetry_row(int(row_id), arguments.get("class"))
         if row is None:
             raise Refused(ErrorCode.INVALID_PARAMETER, argument=name)
-        wanted.append(Subscription(row, rate_hz or None))
-    device.subscriptions.replace("request", wanted)
+        subscriptions.append(Subscription(row, rate_hz or None))
+    device.subscriptions.replace("request", subscriptions)
 
 
 def select_unsolicited(device: Device, arguments: Arguments) -> None:

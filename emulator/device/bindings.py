@@ -70,7 +70,7 @@ def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
     return getter if field.enum is None else _named(getter, field)
 
 
-def _health(given: Getter, field: Field, icd: InterfaceDefinition) -> Getter:
+def _health(getter: Getter, field: Field, icd: InterfaceDefinition) -> Getter:
     """Return a getter for a number of the profile's `[health]`.
 
     If the profile has none, the value is the field's default, otherwise the modelled quantity of its unit.
@@ -79,13 +79,13 @@ def _health(given: Getter, field: Field, icd: InterfaceDefinition) -> Getter:
         scale = factor(icd.model.quantities[name].unit, field.unit)
         if scale is not None:
             modelled = _scaled(getter_of(name), scale)
-            return lambda shot: modelled(shot) if (value := given(shot)) is None else value
-    return given
+            return lambda snapshot: modelled(snapshot) if (value := getter(snapshot)) is None else value
+    return getter
 
 
 def _accepted(telecommand: str, name: str) -> Getter:
     """Return the getter for a last accepted value of a telecommand."""
-    return lambda shot: shot.accepted.get(telecommand, {}).get(name)
+    return lambda snapshot: snapshot.accepted.get(telecommand, {}).get(name)
 
 
 def _scaled(getter: Getter, scale: float) -> Getter:

@@ -1,6 +1,6 @@
 """Images for download: capture, storage and transfer.
 
-Stored images are files, of which the oldest gives way to a new one. A download keeps the image that it opened.
+Stored images are files; a new one replaces the oldest. A download keeps the image that it has opened.
 """
 
 from __future__ import annotations

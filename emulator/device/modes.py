@@ -38,7 +38,7 @@ class Mode(StrEnum):
 
 
 _RUNNING: Final = frozenset(Mode) - {Mode.BOOT, Mode.ERROR}
-COMMANDED: Final[dict[Mode, frozenset[Mode]]] = {
+COMMANDABLE_MODES: Final[dict[Mode, frozenset[Mode]]] = {
     **dict.fromkeys(_RUNNING, _RUNNING),
     Mode.BOOT: frozenset(),
     Mode.ERROR: frozenset({Mode.STANDBY}),
@@ -76,11 +76,11 @@ class Modes:
         """Name in `device_error` of the error; empty in any other mode."""
         self._on_change = on_change
 
-    def command(self, wanted: Mode, *, has_attitude: bool) -> bool:
+    def command(self, mode: Mode, *, has_attitude: bool) -> bool:
         """Change the mode by telecommand; return False if this is not allowed. Tracking needs an attitude to start from."""
-        if wanted not in COMMANDED[self.mode] or (wanted is Mode.TRACKING and not has_attitude):
+        if mode not in COMMANDABLE_MODES[self.mode] or (mode is Mode.TRACKING and not has_attitude):
             return False
-        self._enter(wanted, Cause.COMMAND)
+        self._enter(mode, Cause.COMMAND)
         return True
 
     def reset(self) -> None:

@@ -17,7 +17,7 @@ from starhil.protocol.icd.values import MessageError, Parameter, Value
 
 ParameterValue = bool | int | float | str
 
-ORDERED: Final[tuple[tuple[str, str], ...]] = (("min_star_pixels", "max_star_pixels"),)
+ORDERED_PARAMETERS: Final[tuple[tuple[str, str], ...]] = (("min_star_pixels", "max_star_pixels"),)
 """Pairs whose first parameter must not exceed the second."""
 
 ORBIT_SIZE: Final = ("orbit_semi_major_axis", "orbit_eccentricity")
@@ -55,7 +55,7 @@ def flipped_number(value: float, wire_format: str, bit: int) -> float:
 
 def _contradiction(values: Mapping[str, ParameterValue]) -> tuple[tuple[str, ...], str] | None:
     """Return the names of parameters that contradict each other, with the reason, or None."""
-    for low, high in ORDERED:
+    for low, high in ORDERED_PARAMETERS:
         if float(values[low]) > float(values[high]):
             return (low, high), f"{low} {values[low]} is above {high} {values[high]}"
     axis_km, eccentricity = (float(values.get(name, 0.0)) for name in ORBIT_SIZE)

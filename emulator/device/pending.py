@@ -1,7 +1,7 @@
 """Answers that take time: a parameter is being saved, an image is being captured or opened.
 
-Whoever does the work makes a `PendingAnswer`, returns it at once, and ends it once with the result. Whoever owes the
-answer says what is to happen then. It makes no difference which of the two comes first.
+The code that does the work returns a `PendingAnswer` immediately, and completes it once with the result. The code that
+owes the answer registers what is to be done with the result. Either may happen first.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The device at one moment: all that a row reports.
 
-A quantity is a function of a `Snapshot`. All its fields are values that do not change, and none leads to the device or to
-a clock: whatever a row contains is of one moment, though the clock goes on while its bytes are made. Values that
-several quantities share are computed from the fields, once, at first use.
+A quantity is a function of a `Snapshot`. Its fields are immutable values, and none of them refers to the device or a
+clock: a row describes one moment, although the clock runs on while its bytes are packed. Values that several quantities
+share are computed from the fields once, at first use.
 """
 
 from __future__ import annotations

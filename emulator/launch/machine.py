@@ -39,12 +39,12 @@ def _processor() -> str:
     }
     flags = fields.get("flags", fields.get("features", "")).split()
     vectors = next((each for each in _VECTORS if each in flags), "")
-    chosen = os.environ.get("NUMBA_CPU_NAME", "")
+    target = os.environ.get("NUMBA_CPU_NAME", "")
     parts = (
         fields.get("model name", ""),
         platform.machine(),
         vectors,
-        f"kernels for {chosen}" if chosen else "",
+        f"kernels for {target}" if target else "",
     )
     return ", ".join(part for part in parts if part)
 

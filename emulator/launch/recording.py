@@ -28,7 +28,7 @@ from starhil.protocol.files.validation import problems
 Model = TypeVar("Model", bound=BaseModel)
 
 
-_COPIED: Final = [(key.split("."), mark.recorded_as) for key, mark in PATHS.items() if mark.recorded_as]
+_COPIED_KEYS: Final = [(key.split("."), mark.recorded_as) for key, mark in PATHS.items() if mark.recorded_as]
 """Keys of files that a recording has a copy of, and the name of the copy."""
 
 
@@ -37,10 +37,8 @@ class _RunFile(BaseModel):
 
     folder: str
     profile: Profile
-    ends: bool = False
-    """Whether the tape of a complete run ends with the entry `end`: not if an older version recorded it."""
-    machine: dict[str, str] = {}
-    """Processor and versions of libraries, see `machine.description`; empty if an older version recorded it."""
+    machine: dict[str, str]
+    """Processor and versions of libraries, see `machine.description`."""
 
 
 def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
@@ -62,7 +60,7 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     values = profile.model_dump(mode="json")
     # what the profile does not set is the unit's, which may have no dialects and another bit rate
     values["links"]["serial"] = profile.links.serial.model_dump(mode="json", exclude_unset=True)
-    for keys, name in _COPIED:
+    for keys, name in _COPIED_KEYS:
         table, key = _table_of(values, keys)
         if key in table:
             shutil.copyfile(profile.folder / table[key], folder / name)
@@ -80,7 +78,6 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
         "machine": description(),
         "folder": str(profile.folder.resolve()),
         "profile": values,
-        "ends": True,
     }
     (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
 
@@ -98,10 +95,7 @@ class RecordedRun:
     """What is known of a recorded run beside its tape."""
 
     profile: Profile
-    ends: bool
-    """Whether its tape ends with the entry `end`."""
     machine: Mapping[str, str]
-    """Machine on which it was recorded."""
 
 
 def read_run(folder: Path) -> RecordedRun:
@@ -113,12 +107,12 @@ def read_run(folder: Path) -> RecordedRun:
         raise EmulatorError(f"{error}; give a folder made by starhil run --record") from None
     run = validated(_RunFile, text, path)
     values = run.profile.model_dump(exclude_unset=True)
-    for keys, name in _COPIED:
+    for keys, name in _COPIED_KEYS:
         table, key = _table_of(values, keys)
         if table.get(key) == name:
             table[key] = str((folder / name).absolute())
     profile = Profile.model_validate(values)
-    return RecordedRun(profile.read_from(Path(run.folder) / RUN_FILE), run.ends, run.machine)
+    return RecordedRun(profile.read_from(Path(run.folder) / RUN_FILE), run.machine)
 
 
 def read_recorded(path: Path) -> str:

@@ -29,6 +29,7 @@ from starhil.emulator.run.recorder import (
     Done,
 )
 from starhil.emulator.run.tape import (
+    AwaitedPhase,
     ClearedFaults,
     End,
     Entry,
@@ -38,6 +39,7 @@ from starhil.emulator.run.tape import (
     LinkItem,
     NewFaults,
     NewTruth,
+    Note,
     PipelineAnswer,
     PipelineState,
     Stored,
@@ -244,7 +246,7 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
             if pipeline is None:
                 raise EmulatorError("replay: the run has no pipeline")
             play = _Playing(again, head, player, pipeline, await head.imager.start())
-            recording = await play.entries(folder, report, ends=recording_of.ends)
+            recording = await play.entries(folder, report)
             to_the_end = not report.differences
             new_decoder = partial(Decoder, head.icd, head.serial_dialect)
             for link in sorted({each.bus for each in recording} | set(player.receivers)):
@@ -265,8 +267,6 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
 
 
 class _Playing:
-    """Plays entries one by one."""
-
     def __init__(
         self, run: Run, head: Head, player: Player, pipeline: PlayedPipeline, warm: PipelineReady
     ) -> None:
@@ -278,7 +278,7 @@ class _Playing:
         self.ended = False
         """Whether the entry `end` was played."""
 
-    async def entries(self, folder: Path, report: ReplayReport, *, ends: bool) -> list[WireItem]:
+    async def entries(self, folder: Path, report: ReplayReport) -> list[WireItem]:
         """Play a tape to its end, or to the entry at which the device deviates; return what passed the links until there."""
         recording: list[WireItem] = []
         stepped = self.player.stepped
@@ -298,7 +298,7 @@ class _Playing:
             except (EmulatorError, ProtocolError, StaridError) as error:
                 raise EmulatorError(f"replay {where}: {error}") from None
             report.entries += not self.ended
-        if ends and not self.ended:
+        if not self.ended:
             report.differences.append(
                 f"{folder / EVENTS_FILE}: truncated at {stepped.now_ns() / NANOSECONDS:.6f} s: the run was killed, or lines are missing"
             )
@@ -325,12 +325,16 @@ class _Playing:
                 if not player.writes:
                     raise _DeviationError("nothing is being written")
                 player.writes.popleft()()
+            case Note():
+                pass
             case End():
                 self.ended = True
             case _:
                 await self._play_input(entry)
 
-    async def _play_input(self, entry: LinkItem | FeedMessage | NewTruth | NewFaults | ClearedFaults) -> None:
+    async def _play_input(
+        self, entry: LinkItem | FeedMessage | NewTruth | NewFaults | ClearedFaults | AwaitedPhase
+    ) -> None:
         """Play what came from outside, as `_play` does."""
         match entry:
             case LinkItem():
@@ -349,3 +353,5 @@ class _Playing:
                 self.head.faults.inject(entry.request)
             case ClearedFaults():
                 self.head.faults.clear()
+            case AwaitedPhase():
+                self.head.device.cycle.at_phase(entry.phase, lambda _due_ns: None)

@@ -41,8 +41,6 @@ def units_sent(items: Iterable[WireItem]) -> Iterator[Any]:
 
 @dataclass
 class _Message:
-    """A message that was sent."""
-
     name: str
     """Row or frame."""
     data: bytes
@@ -81,7 +79,6 @@ def _parts(item: WireItem, whole: int) -> Iterator[WireItem]:
 
 
 def _named(reply: Reply, decoder: Decoder) -> tuple[str, bytes]:
-    """Return the name of a reply, and its data."""
     row = decoder.row_of(reply)
     name = reply.kind.value if row is None else row.name
     if reply.kind in {ReplyKind.ACK, ReplyKind.NACK}:

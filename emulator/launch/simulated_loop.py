@@ -1,4 +1,4 @@
-"""An event loop whose time passes only while everybody waits, so that a run takes no longer than its computing."""
+"""An event loop whose time advances only while all tasks wait, so that a run takes no longer than its computation."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ class MemoryTransport(Transport[Item]):
         super().__init__(description)
         self._now_s = now_s
         self.sent: list[tuple[float, Item]] = []
-        """Items that the device has sent and nobody has taken, each with its time, seconds."""
+        """Items that the device has sent and that have not been read, each with its time, seconds."""
         self.reads = True
         """Whether the peer reads; otherwise what the device sends is dropped, as on a pty without a reader."""
 
@@ -119,7 +119,6 @@ class _InternalErrors(logging.Handler):
         self.texts: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a message."""
         self.texts.append(record.getMessage())
 
 

@@ -31,7 +31,7 @@ FLUSH_MARGIN_S: Final = 0.01
 
 
 @dataclass
-class Heard:
+class ObcRequests:
     """Requests of the OBC on a link, without those of the console."""
 
     requests: int = 0
@@ -57,8 +57,7 @@ class Link(ABC, Generic[Item]):
         device = self._device = requests.device
         self._requests = requests
         self.transport: Final = transport
-        self.heard: Final = Heard()
-        """Requests of the OBC."""
+        self.obc_requests: Final = ObcRequests()
         self.wire: WireFaults[Item] = WireFaults(self._transmit, damage, device.clock, device.scheduler, seed)
         """Outgoing side of the link, with its faults."""
         self._timer: Event | None = None
@@ -72,6 +71,11 @@ class Link(ABC, Generic[Item]):
     def dialect(self) -> Dialect | None:
         """The current format of replies, on a line whose unit has dialects."""
         return None
+
+    @property
+    def shown_in_replies(self) -> frozenset[str]:
+        """What its messages carry besides data: `id`, `sequence`, `check`."""
+        return frozenset(("id", "sequence"))
 
     @property
     def ready_fields(self) -> dict[str, str]:
@@ -101,7 +105,6 @@ class Link(ABC, Generic[Item]):
 
 
 AnyLink: TypeAlias = Link[Any]
-"""An open link of any kind."""
 
 
 class Phase(Enum):
@@ -198,7 +201,6 @@ class RequestLink(Link[Item], Generic[Item, Style]):
                 self._style_changed(before)
 
     def _send_unsolicited(self, reply: Reply) -> None:
-        """Send unsolicited telemetry."""
         if self._exchange.phase is Phase.EXECUTING:
             self._exchange.caused.append(reply)
         else:
@@ -220,10 +222,11 @@ class RequestLink(Link[Item], Generic[Item, Style]):
         exchange = self._exchange = Exchange(self._style)
         console = self._is_console(event)
         if not console:
-            self.heard.count()
+            self.obc_requests.count()
         try:
             answer = self._requests.handle(event, console=console)
         except BaseException:
+            # later requests would wait for this one for ever
             exchange.advance(Turn.ANSWERED)
             raise
         if isinstance(answer, PendingAnswer):

@@ -1,4 +1,4 @@
-"""The address of a node on a CAN bus, which no other node may have: both would answer each request."""
+"""The address of a node on a CAN bus. It must be unique: two nodes with the same address would both answer each request."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ class SerialLink(RequestLink[bytes, SerialStyle]):
     def _restart_numbers(self, _cause: str) -> None:
         self._numbered = 0
 
-    def _is_console(self, request: Request) -> bool:  # noqa: ARG002 (nobody else is on its line)
+    def _is_console(self, request: Request) -> bool:  # noqa: ARG002 -- a serial line has only one peer
         return self._console
 
     def _new_receiver(self) -> Receiver[bytes, Request]:
@@ -88,6 +88,11 @@ class SerialLink(RequestLink[bytes, SerialStyle]):
         if len(dialects) > 1:
             dialect = Dialect(str(parameters["serial_dialect"]))
         return SerialStyle(dialect, int(parameters["serial_baud"]))
+
+    @property
+    def shown_in_replies(self) -> frozenset[str]:
+        """What its messages carry besides data, in some dialect."""
+        return self._stack.shown_in_replies
 
     @property
     def ready_fields(self) -> dict[str, str]:

@@ -106,7 +106,7 @@ class LinkKind(ABC):
     key: ClassVar[str]
     """Key of `[links]` that opens the link."""
     address: ClassVar[str] = ""
-    """Parameter with the address on the bus; empty if nobody else is on the line."""
+    """Parameter with the address on the bus; empty for a point-to-point line."""
     role: ClassVar[str] = ""
     """What the address is called in messages."""
 

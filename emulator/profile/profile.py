@@ -6,16 +6,15 @@ is validated; an error names the file, the key and the remedy.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 from pydantic import (
     Field,
     PrivateAttr,
     ValidationError,
-    field_validator,
     model_validator,
 )
 
@@ -24,6 +23,7 @@ from starhil.emulator.profile.sections import (
     CalibrationConfig,
     CameraConfig,
     CatalogConfig,
+    ClockConfig,
     DeviceConfig,
     ImagesConfig,
     LinksConfig,
@@ -34,15 +34,17 @@ from starhil.emulator.profile.sections import (
     TimingConfig,
 )
 from starhil.emulator.profile.toml_file import find_toml, read_toml
-from starhil.emulator.simulation.config_model import Strict, UserPath
+from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sensor.sky.tables import SKY
+from starhil.emulator.simulation.config_model import Strict, UserPath, plain_model
 from starhil.emulator.truth.config import FixedConfig, OrbitConfig, TruthConfig, profile_paths
 from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError, remedy
 from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled_units, find, not_found
 from starhil.protocol.files.user_file import TomlError, parse_toml
-from starhil.protocol.files.validation import problems
+from starhil.protocol.files.validation import TableOf, problems
 from starhil.protocol.unit import load_unit
-from starid.catalog.earth import unix_time
 from starid.errors import StaridError
+from starid.identification.options import ALGORITHMS
 
 if TYPE_CHECKING:
     from starhil.protocol.icd.values import Parameter
@@ -71,9 +73,9 @@ class Profile(Strict):
     """Stars."""
     camera: CameraConfig = CameraConfig()
     """Optics and pixel array."""
-    sensor: dict[str, Any] = Field(default_factory=dict)
+    sensor: Annotated[dict[str, Any], TableOf(plain_model(SensorModel))] = Field(default_factory=dict)
     """Fields of `starhil.emulator.sensor.model.SensorModel`, except those that are device parameters."""
-    sky: dict[str, Any] = Field(default_factory=dict)
+    sky: Annotated[dict[str, Any], TableOf(SKY)] = Field(default_factory=dict)
     """Date and bodies (`starhil.emulator.sensor.sky.view.Sky`), and fields of
     `starhil.emulator.sensor.sky.objects.SkyObjects`."""
     identifier: dict[str, Any] = Field(default_factory=dict)
@@ -88,6 +90,8 @@ class Profile(Strict):
     """Identification and boot."""
     timing: TimingConfig = TimingConfig()
     """Modelled processing times."""
+    clock: ClockConfig = ClockConfig()
+    """Errors of the clock and of the latency."""
     power: PowerConfig = PowerConfig()
     """Currents by phase."""
     thermal: ThermalConfig = ThermalConfig()
@@ -107,14 +111,6 @@ class Profile(Strict):
 
     _source: Path | None = PrivateAttr(default=None)
     _layers: tuple[Layer, ...] = PrivateAttr(default=())
-
-    @field_validator("sky")
-    @classmethod
-    def _check_date(cls, sky: dict[str, Any]) -> dict[str, Any]:
-        try:
-            return {**sky, "date": unix_time(sky["date"])} if "date" in sky else sky
-        except ValueError as error:
-            raise ValueError(f"date: {error}") from None
 
     @model_validator(mode="after")
     def _some_use_of_images(self) -> Self:
@@ -173,7 +169,7 @@ ALTERNATIVES: Final = (
 CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"})
 """Device parameters that describe the camera; by default, the device is calibrated exactly."""
 
-OF_CAMERA: Final = CALIBRATION | {"limiting_magnitude"}
+CAMERA_PARAMETERS: Final = CALIBRATION | {"limiting_magnitude"}
 """Device parameters that are not inherited by a profile with another camera."""
 
 PATHS: Final = profile_paths(Profile)
@@ -183,13 +179,13 @@ _LONGEST_SHOWN: Final = 200
 """Longest part of a `--set` that an error repeats before it says what is wrong with it, characters."""
 
 _A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
-OF_FAULTS: Final = dict.fromkeys(
-    ("fault", "faults", "optical", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
+FAULT_KEY_HINTS: Final = dict.fromkeys(
+    ("fault", "faults", "optical", "telemetry", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
      "delay_s", "split", "gap_s"),
     _A_FAULT,
 )  # fmt: skip
 """Keys of faults, which a profile does not have, and the hint for whoever writes one there."""
-OF_ATTITUDES: Final = {
+ATTITUDE_KEY_HINTS: Final = {
     key: f"; did you mean attitude.{key}?" for key in ("ra_deg", "dec_deg", "roll_deg", "quaternion_xyzw")
 }
 """Keys of an attitude, and the hint for whoever writes one outside its table."""
@@ -218,52 +214,75 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
         values = merge({key: value for key, value in values.items() if key != "orbit"}, table)
         layers.append((f"orbit {name}", table))
     layers += [_apply_override(values, override) for override in overrides if override not in presets]
-    found: list[tuple[Sequence[object], str]] = []
+    faults: list[tuple[Sequence[object], str]] = []
     profile = None
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
-        listed = problems(error, Profile, values, also=("extends",), hints=OF_FAULTS | OF_ATTITUDES)
-        found += [(problem.location, str(problem)) for problem in listed]
+        listed = problems(
+            error, Profile, values, also=("extends",), hints=FAULT_KEY_HINTS | ATTITUDE_KEY_HINTS
+        )
+        faults += [(problem.location, str(problem)) for problem in listed]
     name = str(values.get("unit", DEFAULT_UNIT))
     unit = _path_of_unit(name, path.parent)
     if unit is None:
-        found.append((("unit",), f"unit: {not_found('unit', name)}"))
-    for section, check in _checks(values, unit):
-        found += _problems_of_keys(section, values.get(section), check)
-    if found or profile is None:
-        named = ((_source_of(layers, location) or f"profile {path}", text) for location, text in found)
+        faults.append((("unit",), f"unit: {not_found('unit', name)}"))
+    faults += _problems_of_identifier(values)
+    if unit is not None:
+        faults += _problems_of_parameters(values.get("parameters"), unit)
+    if faults or profile is None:
+        named = ((_source_of(layers, location) or f"profile {path}", text) for location, text in faults)
         raise EmulatorError(*(f"{source}: {text}" for source, text in named))
     return profile.read_from(path, layers)
 
 
-def _checks(
-    values: Mapping[str, Any], unit: Path | None
-) -> Iterator[tuple[str, Callable[[dict[str, Any]], object]]]:
-    """Yield the sections whose keys are those of another class or of the unit at a path, each with a check of its table."""
-    run, sky = values.get("run"), values.get("sky")
-    if "sensor" in values:
-        from starhil.emulator.sensor.model import SensorModel
+def _problems_of_identifier(values: Mapping[str, Any]) -> Iterator[tuple[Sequence[object], str]]:
+    """Yield location and text of the problems of `[identifier]`, whose keys are the options of the algorithm."""
+    run, table = values.get("run"), values.get("identifier")
+    algorithm = run.get("algorithm", "geometric") if isinstance(run, dict) else "geometric"
+    if not isinstance(table, dict) or not isinstance(algorithm, str) or algorithm not in ALGORITHMS:
+        return  # reported with the other keys
+    options: type = ALGORITHMS[algorithm].options
+    model = plain_model(options)
+    try:
+        model.model_validate(table)
+    except ValidationError as error:
+        for problem in problems(error, model, table):
+            text = problem.text
+            if problem.unknown:
+                text = text.replace("unknown key", f"not an option of the algorithm {algorithm}", 1)
+            yield ("identifier", *problem.location), f"identifier.{problem.key}".rstrip(".") + f": {text}"
 
-        yield "sensor", lambda table: SensorModel().with_(**table)
-    if isinstance(sky, dict):
-        from starhil.emulator.sensor.sky.view import Sky
 
-        whole = {key: sky[key] for key in ("date", "bodies") if key in sky}
-        yield "sky", lambda table: Sky({**whole, **table})
-    if "identifier" in values:
-        from starhil.emulator.sensor.pipeline.star_identifiers import check_options
-        from starid.identification.star_identifier import ALGORITHMS
+def _problems_of_parameters(table: object, unit: Path) -> Iterator[tuple[Sequence[object], str]]:
+    """Yield location and text of the problems of `[parameters]`, whose keys are the parameters of the unit."""
+    if not isinstance(table, dict):
+        return
+    try:
+        known = load_unit(unit).device_parameters
+    except IcdError:
+        return  # reported when the unit is loaded
+    count = 0
+    for number, (name, value) in enumerate(table.items()):
+        if count >= MAX_PROBLEMS - 1:
+            text = f"parameters: {len(table) - number} more keys are not checked; correct these first"
+            yield ("parameters",), text
+            return
+        for problem in _problems_of_parameter(known, name, value):
+            yield ("parameters", name), problem
+            count += 1
 
-        algorithm = run.get("algorithm", "geometric") if isinstance(run, dict) else "geometric"
-        if algorithm in ALGORITHMS:
-            yield "identifier", lambda table: check_options(algorithm, table)
-    if "parameters" in values and unit is not None:
+
+def _problems_of_parameter(known: Mapping[str, Parameter], name: str, value: Any) -> Iterator[str]:
+    if name not in known:
+        yield f"parameters.{name}: unknown key{remedy(name, known)}"
+    elif known[name].profile_key:
+        yield f"parameters.{name}: set {known[name].profile_key} instead"
+    else:
         try:
-            known = load_unit(unit).device_parameters
-        except IcdError:
-            return  # reported when the unit is loaded
-        yield "parameters", lambda table: _check_parameters(known, table)
+            known[name].check(value)
+        except ProtocolError as error:
+            yield from (f"parameters.{problem}" for problem in error.problems)
 
 
 def _path_of_unit(name: str, folder: Path) -> Path | None:
@@ -272,40 +291,6 @@ def _path_of_unit(name: str, folder: Path) -> Path | None:
         return path if name and path.exists() else None
     except OSError:  # too long a name, for example
         return None
-
-
-def _problems_of_keys(
-    section: str, table: object, check: Callable[[dict[str, Any]], object]
-) -> Iterator[tuple[Sequence[object], str]]:
-    """Yield location and text of the problems of a table, each key of which is checked alone.
-
-    The rest of a table with many problems is not checked.
-    """
-    found, keys = 0, table if isinstance(table, dict) else {}
-    for number, (key, value) in enumerate(keys.items()):
-        if found >= MAX_PROBLEMS - 1:
-            yield (
-                (section,),
-                f"{section}: {len(keys) - number} more keys are not checked; correct these first",
-            )
-            return
-        try:
-            check({key: value})
-        except (EmulatorError, ProtocolError) as error:
-            yield from (((section, key), text) for text in error.problems)
-            found += 1
-
-
-def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) -> None:
-    for name, value in table.items():
-        if name not in known:
-            raise EmulatorError(f"parameters.{name}: unknown key{remedy(name, known)}")
-        if known[name].profile_key:
-            raise EmulatorError(f"parameters.{name}: set {known[name].profile_key} instead")
-        try:
-            known[name].check(value)
-        except ProtocolError as error:
-            raise EmulatorError(f"parameters.{error}") from None
 
 
 def camera_of(name_or_path: str) -> Camera:
@@ -361,16 +346,18 @@ def _drop_parameters_of_camera(values: dict[str, Any]) -> None:
     values.pop("calibration", None)
     parameters = values.get("parameters")
     if isinstance(parameters, dict):
-        values["parameters"] = {key: value for key, value in parameters.items() if key not in OF_CAMERA}
+        values["parameters"] = {
+            key: value for key, value in parameters.items() if key not in CAMERA_PARAMETERS
+        }
 
 
-def _replaced_by(given: Iterable[str]) -> set[str]:
+def _replaced_by(present: Iterable[str]) -> set[str]:
     """Return the keys of a table that are excluded by the given ones."""
     return {
         key
         for forms in ALTERNATIVES
         for keys, by in permutations(forms, 2)
-        if not by.isdisjoint(given)
+        if not by.isdisjoint(present)
         for key in keys
     }
 

@@ -54,7 +54,6 @@ class Recorder(Wiring):
         self.folder = folder
         self.file: OutputFile | None = None
         self.output = Output(f"recording {folder}")
-        """All files of the recording."""
         self._held: list[Callable[[], None]] | None = []
         """Entries that arrived while the links were being opened, which takes no time on the tape; None
         afterwards."""

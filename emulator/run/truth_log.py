@@ -24,13 +24,14 @@ COLUMNS: Final = (
     "cross_boresight_arcsec", "roll_arcsec", "total_arcsec", "sigma_cross_arcsec", "sigma_roll_arcsec",
     "stars_detected", "stars_matched", "rms_px", "latency_ms", "processing_ms", "render_ms", "detect_ms", "identify_ms", "late",
     "search", "triggered", "error_psi", "cell", "weights", "region_deg", "stars_used", "stars_removed", "motion_rotation_deg",
-    "motion_translation_deg", "refined",
+    "motion_translation_deg", "refined", "false_detected", "false_removed", "clock_error_s",
 )  # fmt: skip
 """Columns: device time as Unix time, quaternions ICRS→sensor scalar last, errors of the measured attitude.
 
 `latency_ms` is simulation time from mid-exposure to publication. `processing_ms` and the next three columns
 are wall times; they are empty on the stepped clock, so that the same run gives the same file. The columns from
-`search` on are those of `starid.identification.solution.FeatureReport`; they are empty for `geometric`.
+`search` to `false_removed` are those of `starid.identification.solution.FeatureReport`, and the false stars among the detections and among
+those that the filter removed; they are empty for `geometric`.
 """
 
 WALL_TIMES: Final = ("processing_ms", "render_ms", "detect_ms", "identify_ms")
@@ -43,7 +44,9 @@ _DIGITS: Final = 6
 def _is_exact(name: str) -> bool:
     """Return whether the floats of a column are written with all digits: quaternions and simulation times."""
     return (
-        name.startswith(("true_q", "measured_q")) or name.endswith("time_s") or name == "time_of_exposure_s"
+        name.startswith(("true_q", "measured_q"))
+        or name.endswith(("time_s", "clock_error_s"))
+        or name == "time_of_exposure_s"
     )
 
 
@@ -79,6 +82,7 @@ def compare(measurement: Measurement) -> dict[str, Any]:
         "frame": measurement.counter,
         "time_of_exposure_s": measurement.mid_unix_ns / NANOSECONDS,
         "run_time_s": measurement.mid_ns / NANOSECONDS,
+        "clock_error_s": measurement.clock_error_ns / NANOSECONDS,
         "mode": measurement.mode.value,
         "valid": measurement.valid,
         "reason": measurement.reason,
@@ -113,19 +117,21 @@ def compare(measurement: Measurement) -> dict[str, Any]:
             "rms_px": result.rms_px,
         }
     if result.features is not None:
-        known = result.features
+        features = result.features
         row |= {
-            "search": known.search,
-            "triggered": known.triggered,
-            "error_psi": None if math.isnan(known.error_psi) else known.error_psi,
-            "cell": known.cell,
-            "weights": known.weights,
-            "region_deg": known.region_deg,
-            "stars_used": known.stars,
-            "stars_removed": known.removed,
-            "motion_rotation_deg": known.rotation_deg,
-            "motion_translation_deg": known.translation_deg,
-            "refined": known.refined,
+            "search": features.search,
+            "triggered": features.triggered,
+            "error_psi": None if math.isnan(features.error_psi) else features.error_psi,
+            "cell": features.cell,
+            "weights": features.weights,
+            "region_deg": features.region_deg,
+            "stars_used": features.stars,
+            "stars_removed": features.removed,
+            "motion_rotation_deg": features.rotation_deg,
+            "motion_translation_deg": features.translation_deg,
+            "refined": features.refined,
+            "false_detected": result.false_detected,
+            "false_removed": result.false_removed,
         }
     return {name: row.get(name) for name in COLUMNS}
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any, Final, Self
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, TypeAlias, get_args
 
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
-from starhil.protocol.errors import remedy
+from starhil.emulator.simulation.limited import limited
 from starid.arrays import Array
 from starid.attitude import ARCSEC_PER_RAD
 
@@ -22,12 +22,8 @@ ARCSEC2_PER_SR: Final = (180.0 * 3600.0 / math.pi) ** 2
 SOLAR_COLOUR_B_V: Final = 0.65
 """B−V of a star for which the colour term is zero."""
 
-_BITS: Final = (8, 12, 16)
-
-
-def _limited(default: float, low: float, high: float, unit: str) -> Any:
-    """Return a field with its default and limits; whole numbers if the limits are."""
-    return field(default=default, metadata={"limits": (low, high, unit)})
+Bits: TypeAlias = Literal[8, 12, 16]
+"""Bits per pixel."""
 
 
 @dataclass(frozen=True)
@@ -41,94 +37,89 @@ class SensorModel:
     s for V = 6.
     """
 
-    exposure_s: float = _limited(0.2, 1e-6, 60.0, "seconds")
+    exposure_s: float = limited(1e-6, 60.0, 0.2, unit="seconds")
     """Exposure, seconds."""
-    aperture_m: float = _limited(0.012, 1e-4, 1.0, "metres")
+    aperture_m: float = limited(1e-4, 1.0, 0.012, unit="metres")
     """Diameter of the entrance pupil, metres."""
-    transmission: float = _limited(0.75, 1e-3, 1.0, "a share")
-    quantum_efficiency: float = _limited(0.45, 1e-3, 1.0, "a share")
+    transmission: float = limited(1e-3, 1.0, 0.75, unit="a share")
+    quantum_efficiency: float = limited(1e-3, 1.0, 0.45, unit="a share")
     """Fractions of photons that pass the lens and that free an electron, averaged over the band."""
-    zero_point_photons_s_m2: float = _limited(4.6e10, 1e6, 1e13, "photons/s/m²")
+    zero_point_photons_s_m2: float = limited(1e6, 1e13, 4.6e10, unit="photons/s/m²")
     """Photons/s/m² in the band from a star of V = 0 and solar colour."""
-    colour_term: float = _limited(0.0, -2.0, 2.0, "magnitudes a magnitude of B−V")
+    colour_term: float = limited(-2.0, 2.0, 0.0, unit="magnitudes a magnitude of B−V")
     """The sensor's magnitude is V − colour_term·(B−V − 0.65); about 0.4 for silicon, which favours red stars."""
-    psf_sigma_px: float = _limited(0.8, 0.3, 12.0, "pixels")
+    psf_sigma_px: float = limited(0.3, 12.0, 0.8, unit="pixels")
     """Standard deviation of the Gaussian spot at the image centre, pixels. 0.8 is about the smallest spot that can be
     fitted without pixel-phase error."""
-    psf_growth: float = _limited(0.0, 0.0, 5.0, "a share")
+    psf_growth: float = limited(0.0, 5.0, 0.0, unit="a share")
     """Relative increase of the spot width from the image centre to the edge: along x with the square of x, along y
     with the square of y."""
-    gain: float = _limited(1.0, 0.01, 1000.0, "times")
+    gain: float = limited(0.01, 1000.0, 1.0, unit="times")
     """Analog gain before the converter."""
-    bits: int = 8
+    bits: Bits = 8
     """8, 12 or 16."""
-    adc_range_e: float = _limited(6400.0, 1.0, 1e7, "electrons")
+    adc_range_e: float = limited(1.0, 1e7, 6400.0, unit="electrons")
     """Full range of the converter at gain 1, electrons."""
-    offset_share: float = _limited(0.03, 0.0, 0.5, "a share of the converter's range")
+    offset_share: float = limited(0.0, 0.5, 0.03, unit="a share of the converter's range")
     """Black level as a fraction of the range."""
-    full_well_e: float = _limited(15000.0, 10.0, 1e7, "electrons")
+    full_well_e: float = limited(10.0, 1e7, 15000.0, unit="electrons")
     """Full-well capacity, electrons."""
-    read_noise_e: float = _limited(12.0, 0.0, 1e4, "electrons")
+    read_noise_e: float = limited(0.0, 1e4, 12.0, unit="electrons")
     """Electrons, standard deviation."""
-    dark_e_s: float = _limited(30.0, 0.0, 1e6, "electrons/s")
+    dark_e_s: float = limited(0.0, 1e6, 30.0, unit="electrons/s")
     """Mean dark current at `reference_c`, electrons/s."""
-    temperature_c: float = _limited(20.0, -100.0, 150.0, "°C")
+    temperature_c: float = limited(-100.0, 150.0, 20.0, unit="°C")
     """Temperature of detector and lens, °C, unless another is given for a frame."""
-    reference_c: float = _limited(20.0, -100.0, 150.0, "°C")
+    reference_c: float = limited(-100.0, 150.0, 20.0, unit="°C")
     """Temperature at which dark currents, lens and mounting have their stated values, °C."""
-    dark_doubling_c: float = _limited(6.5, 1.0, 100.0, "°C")
+    dark_doubling_c: float = limited(1.0, 100.0, 6.5, unit="°C")
     """Temperature rise that doubles the dark current, °C; 5 to 8 for silicon."""
-    row_time_s: float = _limited(0.0, 0.0, 0.01, "seconds")
+    row_time_s: float = limited(0.0, 0.01, 0.0, unit="seconds")
     """Time from the exposure of one row to the next, seconds: 0 for a global shutter, which exposes all rows at once.
     The middle row of a rolling shutter is exposed at the time of the frame."""
-    boresight_drift_x: float = _limited(0.0, -1000.0, 1000.0, "arcseconds/°C")
-    boresight_drift_y: float = _limited(0.0, -1000.0, 1000.0, "arcseconds/°C")
-    boresight_drift_z: float = _limited(0.0, -1000.0, 1000.0, "arcseconds/°C")
+    boresight_drift_x: float = limited(-1000.0, 1000.0, 0.0, unit="arcseconds/°C")
+    boresight_drift_y: float = limited(-1000.0, 1000.0, 0.0, unit="arcseconds/°C")
+    boresight_drift_z: float = limited(-1000.0, 1000.0, 0.0, unit="arcseconds/°C")
     """Rotation of the optics relative to the mounting about the axes of the sensor frame, arcseconds/°C."""
-    focal_drift: float = _limited(0.0, -1e-3, 1e-3, "a share/°C")
+    focal_drift: float = limited(-1e-3, 1e-3, 0.0, unit="a share/°C")
     """Relative change of the focal length, 1/°C."""
-    k1_drift: float = _limited(0.0, -1e-2, 1e-2, "1/°C")
+    k1_drift: float = limited(-1e-2, 1e-2, 0.0, unit="1/°C")
     """Change of the distortion k1, 1/°C."""
-    pixel_um: float = _limited(12.0, 0.5, 100.0, "micrometres")
+    pixel_um: float = limited(0.5, 100.0, 12.0, unit="micrometres")
     """Width of a pixel, micrometres; it decides only what particles do."""
-    epi_um: float = _limited(10.0, 0.1, 1000.0, "micrometres")
+    epi_um: float = limited(0.1, 1000.0, 10.0, unit="micrometres")
     """Thickness of the epitaxial layer, in which particles leave charge, micrometres."""
-    damage_tev_g: float = _limited(0.0, 0.0, 1e4, "TeV/g")
+    damage_tev_g: float = limited(0.0, 1e4, 0.0, unit="TeV/g")
     """Displacement damage dose of the detector since it was on the ground, TeV/g; 1e10 protons/cm² of 50 MeV give 39. It
     makes hot pixels, and pixels whose dark current switches between two values."""
-    sky_mag_arcsec2: float = _limited(22.1, -10.0, 40.0, "magnitudes/arcsec²")
+    sky_mag_arcsec2: float = limited(-10.0, 40.0, 22.1, unit="magnitudes/arcsec²")
     """Brightness of the sky background (zodiacal light and unresolved stars), V magnitudes/arcsec²."""
-    dsnu: float = _limited(0.2, 0.0, 2.0, "a share of the dark current")
-    prnu: float = _limited(0.01, 0.0, 0.3, "a share")
+    dsnu: float = limited(0.0, 2.0, 0.2, unit="a share of the dark current")
+    prnu: float = limited(0.0, 0.3, 0.01, unit="a share")
     """Standard deviation between pixels of the dark current and of the sensitivity, relative to their means."""
-    hot_pixels: int = _limited(30, 0, 10_000_000, "pixels")
+    hot_pixels: int = limited(0, 10_000_000, 30, unit="pixels")
     """Number of pixels with excessive dark current."""
-    hot_e_s: float = _limited(10000.0, 0.0, 1e7, "electrons/s")
+    hot_e_s: float = limited(0.0, 1e7, 10000.0, unit="electrons/s")
     """Median dark current of hot pixels at `reference_c`, electrons/s; log-normal with a factor of 2.7 per sigma."""
-    dead_pixels: int = _limited(10, 0, 10_000_000, "pixels")
+    dead_pixels: int = limited(0, 10_000_000, 10, unit="pixels")
     """Number of pixels without signal."""
-    pattern_seed: int = _limited(0, 0, 2**63 - 1, "a whole number")
+    pattern_seed: int = limited(0, 2**63 - 1, 0, unit="a whole number")
     """Seed of the fixed pattern."""
-    limiting_magnitude: float = _limited(6.0, -2.0, 20.0, "magnitudes")
+    limiting_magnitude: float = limited(-2.0, 20.0, 6.0, unit="magnitudes")
     """V of the faintest rendered stars; fainter companions within two pixels of one are rendered too."""
 
     def __post_init__(self) -> None:
-        if self.bits not in _BITS or isinstance(self.bits, bool):
-            raise EmulatorError(f"sensor.bits: must be 8, 12 or 16, not {self.bits!r}")
-        for name, (low, high, unit) in _LIMITS.items():
+        """Check the limits, which also hold for what changes during a run: exposure, gain and temperature."""
+        if self.bits not in get_args(Bits):
+            raise EmulatorError(f"sensor.bits: must be one of 8, 12, 16 (given: {self.bits!r})")
+        for name, (low, high, _) in _LIMITS.items():
             value = getattr(self, name)
-            whole = isinstance(low, int)
-            if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
-                kind = "a whole number" if whole else "a number"
-                raise EmulatorError(f"sensor.{name}: must be {kind} ({unit}), not {value!r}")
             if not low <= value <= high:
-                raise EmulatorError(f"sensor.{name}: must be {low:g}…{high:g} ({unit}), not {value!r}")
+                limit = f"at most {high:g}" if value > high else f"at least {low:g}"
+                raise EmulatorError(f"sensor.{name}: must be {limit} (given: {value!r})")
 
     def with_(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed; an unknown name is an error."""
-        known = {each.name for each in fields(self)}
-        for unknown in sorted(changes.keys() - known):
-            raise EmulatorError(f"sensor.{unknown}: unknown key{remedy(unknown, known)}")
+        """Return a copy with some fields changed."""
         return replace(self, **changes)
 
     @property

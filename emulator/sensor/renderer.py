@@ -96,6 +96,18 @@ class Frame:
     """Other objects in the image, if the sky has any."""
 
 
+def _disturbed(
+    path: Array, electrons: Array, objects: SkyObjects, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Displace paths (n, 6) of stars and change their electrons (n,) by the noise of the sky objects."""
+    if objects.star_position_noise_px > 0.0:
+        path = path.copy()
+        path[:, :2] += objects.star_position_noise_px * rng.normal(size=(len(path), 2))
+    if objects.star_magnitude_noise > 0.0:
+        electrons = electrons * 10.0 ** (-0.4 * objects.star_magnitude_noise * rng.normal(size=len(path)))
+    return path, electrons
+
+
 def frame_without_truth(image: GreyImage, frame_index: int) -> Frame:
     """Return the frame of an image (h, w) that was not rendered: it has no stars, and its attitude is the identity."""
     none = np.zeros(0)
@@ -197,12 +209,12 @@ class Renderer:
         mean = self._mean_without_stars(exposure, temperature, area)
         self._pattern.telegraph.add(mean, index, exposure * sensor.dark_factor(temperature))
         planets = () if others is None else others.planets
-        path, chosen, inside = self._paths(optical_axis, rate, exposure, observer, planets)
-        count = int(np.count_nonzero(chosen < len(self._rows)))
-        magnitudes = [planets[number - len(self._rows)].magnitude for number in chosen[count:]]
+        path, sources, inside = self._paths(optical_axis, rate, exposure, observer, planets)
+        count = int(np.count_nonzero(sources < len(self._rows)))
+        magnitudes = [planets[number - len(self._rows)].magnitude for number in sources[count:]]
         planets_e = [self.sensor.electrons(magnitude, exposure) for magnitude in magnitudes]
-        electrons = np.concatenate([self._flux_e_s[chosen[:count]] * exposure, planets_e])
-        drawn, centred = electrons, np.flatnonzero(inside[:count])
+        electrons = np.concatenate([self._flux_e_s[sources[:count]] * exposure, planets_e])
+        drawn, lit, centred = electrons, path, np.flatnonzero(inside[:count])
         object_truth = None
         if others is not None:
             drawn = electrons.copy()
@@ -211,15 +223,16 @@ class Renderer:
                 drawn *= area.seen_at(path[:, :2])
             planet_xy = np.full((len(planets), 2), np.nan)
             shown = count + np.flatnonzero(inside[count:])
-            planet_xy[chosen[shown] - len(self._rows)] = path[shown, :2]
+            planet_xy[sources[shown] - len(self._rows)] = path[shown, :2]
             rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
             false_xy = self._add_false_stars(mean, others, rng, exposure)
+            lit, drawn = _disturbed(path, drawn, others, rng)
             particles = int(rng.poisson(others.cosmic_rays_s * exposure))
             tracks = add_protons(mean, particles, rng, sensor.epi_um, sensor.pixel_um)
             object_truth = ObjectTruth(false_xy, planet_xy, tracks, area.covered_share if area else 0.0)
-        self._add_light(mean, path, drawn)
+        self._add_light(mean, lit, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
-        rows = self._rows[chosen[centred]]
+        rows = self._rows[sources[centred]]
         stars = StarTruth(
             self.catalog.hip[rows],
             rows.astype(np.int64),

@@ -28,12 +28,12 @@ def at_row_times(
     if row_time_s == 0.0 or not np.any(rate_rad_s):
         return vectors
     middle = 0.5 * (camera.height - 1)
-    seen = vectors
+    turned_vectors = vectors
     for _ in range(_ROUNDS):
-        xy, _ = camera.project(seen)
+        xy, _ = camera.project(turned_vectors)
         rows = np.clip(np.nan_to_num(xy[:, 1], nan=middle), -camera.height, 2.0 * camera.height)
-        seen = turned(vectors, rate_rad_s, (rows - middle) * row_time_s)
-    return seen
+        turned_vectors = turned(vectors, rate_rad_s, (rows - middle) * row_time_s)
+    return turned_vectors
 
 
 def turned(vectors: Array, rate_rad_s: Array, times_s: Array) -> Array:

@@ -1,4 +1,4 @@
-"""What a run writes: each output fails alone, with one warning, and the device goes on without it."""
+"""Output of a run: each output fails on its own, with one warning, and the device continues without it."""
 
 from __future__ import annotations
 

@@ -250,11 +250,11 @@ def _from_xml(where: str, kind: str, text: str) -> tuple[str | None, list[Segmen
         root = ET.fromstring(text)  # noqa: S314 (expat limits the expansion of entities)
     except (ET.ParseError, ValueError) as error:
         raise EmulatorError(f"{where}: not XML ({error})") from None
-    found = next((node for node in root.iter() if _name(node) == kind.lower()), None)
-    if found is None:
+    message = next((node for node in root.iter() if _name(node) == kind.lower()), None)
+    if message is None:
         return None, []
     segments = []
-    for node in found.iter("segment"):
+    for node in message.iter("segment"):
         keywords = {each.tag: (each.text or "").strip() for each in node.iterfind("metadata/*")}
         rows = []
         for state in node.iterfind("data/*"):
@@ -264,7 +264,7 @@ def _from_xml(where: str, kind: str, text: str) -> tuple[str | None, list[Segmen
                 rows.append(_row(where, keywords, [(leaf.text or "").strip() for leaf in leaves]))
         keywords["QUATERNION_TYPE"] = "LAST"  # the elements have names, by which they are ordered
         segments.append(Segment(keywords, rows))
-    return found.get("version", ""), segments
+    return message.get("version", ""), segments
 
 
 def _name(node: Any) -> str:

@@ -53,14 +53,14 @@ class InProfileFolder:
 
 def profile_paths(model: type[BaseModel]) -> dict[str, InProfileFolder]:
     """Return the dotted keys of a model that are marked so, those of its tables included."""
-    found: dict[str, InProfileFolder] = {}
+    paths: dict[str, InProfileFolder] = {}
     for name, field in model.model_fields.items():
         for mark in field.metadata:
             if isinstance(mark, InProfileFolder):
-                found[name] = mark
+                paths[name] = mark
         for table in models_in(field.annotation):
-            found |= {f"{name}.{key}": mark for key, mark in profile_paths(table).items()}
-    return found
+            paths |= {f"{name}.{key}": mark for key, mark in profile_paths(table).items()}
+    return paths
 
 
 def models_in(annotation: Any) -> list[type[BaseModel]]:

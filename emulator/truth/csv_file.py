@@ -138,11 +138,11 @@ def _cells(where: str, line: str) -> list[str]:
 
 
 def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
-    known = {"t", *QUATERNION_COLUMNS, *ANGLE_COLUMNS, *RATE_COLUMNS, *ORBIT_COLUMNS}
-    unknown = [name for name in columns if name not in known | {""}]
+    readable = {"t", *QUATERNION_COLUMNS, *ANGLE_COLUMNS, *RATE_COLUMNS, *ORBIT_COLUMNS}
+    unknown = [name for name in columns if name not in readable | {""}]
     if unknown:
         number = columns.index(unknown[0]) + 1
-        raise EmulatorError(f"{where}: column {number} is unknown; known: {', '.join(sorted(known))}")
+        raise EmulatorError(f"{where}: column {number} is unknown; known: {', '.join(sorted(readable))}")
     twice = [name for name in columns if name and columns.count(name) > 1]
     if twice:
         raise EmulatorError(f"{where}: column {twice[0]} appears twice; remove one")

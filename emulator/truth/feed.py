@@ -83,7 +83,6 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._feed = feed
 
     def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002 (asyncio's signature)
-        """Process a datagram."""
         lines = data.split(b"\n", MAX_LINES)
         for line in lines[:MAX_LINES]:
             if line.strip():

@@ -94,15 +94,15 @@ class FeedRates:
         return rate
 
     def _from_attitudes(self, message: _Message) -> Vector:
-        seen = self._seen
-        while len(seen) > 1 and message.at_s - seen[1].at_s >= self._baseline_s:
-            seen.popleft()
-        if not seen:
+        messages = self._seen
+        while len(messages) > 1 and message.at_s - messages[1].at_s >= self._baseline_s:
+            messages.popleft()
+        if not messages:
             return ZERO_RATE
-        span_s = message.at_s - seen[0].at_s
+        span_s = message.at_s - messages[0].at_s
         if span_s < max(self._baseline_s, SHORTEST_S):
             return self._rate
-        return rate_between(seen[0].attitude, message.attitude, span_s)
+        return rate_between(messages[0].attitude, message.attitude, span_s)
 
     def _check_against_attitudes(self, before: _Message | None, message: _Message, rate: Vector) -> None:
         while len(self._seen) > 1:

@@ -46,7 +46,7 @@ log = logging.getLogger("starhil.truth")
 HISTORY: Final = 512
 """Number of messages kept for exposures whose midpoint is in the past."""
 
-NEAR: Final = 0.05
+SPEED_ERROR: Final = 0.05
 """Error of a measured speed that the tracking of drift follows anyway."""
 
 RESTART_S: Final = 1.0
@@ -55,8 +55,6 @@ RESTART_S: Final = 1.0
 
 @dataclass(frozen=True)
 class _HeldMessage:
-    """The truth of an accepted message."""
-
     t: float
     """Simulation time, seconds."""
     state: TruthState
@@ -252,7 +250,7 @@ class LiveTruth:
 def rounded_speed(speed: float) -> float:
     """Return a whole speed, or a whole fraction, if one is near; otherwise, round to two significant digits."""
     whole = max(round(speed), 1) / max(round(1.0 / speed), 1)
-    return whole if abs(speed / whole - 1.0) < NEAR else float(f"{speed:.2g}")
+    return whole if abs(speed / whole - 1.0) < SPEED_ERROR else float(f"{speed:.2g}")
 
 
 def _moved_on(last: TruthState, seconds: float) -> TruthState:

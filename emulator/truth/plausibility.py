@@ -29,7 +29,7 @@ EXCESS_M_S: Final = 2e4
 FASTEST_M_S: Final = 2.5e5
 """No spacecraft is faster relative to the Earth; Parker Solar Probe reaches 0.22·10⁶ m/s."""
 
-SLOWEST: Final = 0.01
+LEAST_CIRCULAR_SHARE: Final = 0.01
 """Least speed above the atmosphere as a fraction of a circular orbit's."""
 
 NEARNESS_S: Final = 15.0 * 365.25 * DAY_S
@@ -77,7 +77,7 @@ def _fault(distance_m: float, speed_m_s: float) -> str:
     near = distance_m < NEAR_EARTH_M
     if speed_m_s > (math.sqrt(2.0 * squared + EXCESS_M_S**2) if near else FASTEST_M_S):
         return "the velocity is that of no spacecraft"
-    if near and distance_m > ATMOSPHERE_M and speed_m_s < SLOWEST * math.sqrt(squared):
+    if near and distance_m > ATMOSPHERE_M and speed_m_s < LEAST_CIRCULAR_SHARE * math.sqrt(squared):
         return "the velocity is far below that of an orbit at this distance"
     return ""
 

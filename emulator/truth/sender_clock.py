@@ -36,7 +36,7 @@ SPEED_TOLERANCE: Final = 0.15
 SAME_SPEED: Final = 0.1
 """Difference in speed below which a speed that differed no longer does."""
 
-STEADY: Final = 1.15
+STEADY_RATIO: Final = 1.15
 """Largest factor between the speeds in the earlier and in the later half of the arrivals."""
 
 APART_S: Final = 0.3
@@ -77,7 +77,7 @@ class SenderSpeed:
         """Determine the speed from the last arrivals, if they agree on it."""
         first, middle, last = (self._arrivals[-n] for n in (count, count // 2, 1))
         ratio, early, late = _ratio(first, last), _ratio(first, middle), _ratio(middle, last)
-        if max(early, late) > STEADY * min(early, late):
+        if max(early, late) > STEADY_RATIO * min(early, late):
             return False
         apart_s = abs((last[0] - first[0]) - (last[1] - first[1])) / self._clock_speed
         if apart_s >= APART_S and min(abs(early - 1.0), abs(late - 1.0)) > SPEED_TOLERANCE:

@@ -100,11 +100,11 @@ class Format42:
 
 def _unix_ns(text: str) -> int:
     """Return the Unix time of a block, nanoseconds."""
-    found = _TIME.search(text)
-    if found is None:
+    match = _TIME.search(text)
+    if match is None:
         raise FeedError("no line TIME year-day-hour:minute:second; is this 42?")
-    year, day, hour, minute, second = (int(part) for part in found.groups()[:5])
-    nanoseconds = int((found[6] or "0").ljust(9, "0"))
+    year, day, hour, minute, second = (int(part) for part in match.groups()[:5])
+    nanoseconds = int((match[6] or "0").ljust(9, "0"))
     try:
         days = date(year, 1, 1).toordinal() - date(1970, 1, 1).toordinal() + day - 1
     except ValueError:

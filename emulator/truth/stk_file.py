@@ -49,7 +49,7 @@ def read_ephemeris(path: Path, text: str) -> OrbitTable:
 
 def _read(where: str, text: str, what: str) -> list[Segment]:
     """Read a file whose data have one of the known formats."""
-    known = {name.lower(): name for name in FORMATS if name.startswith(what)}
+    formats = {name.lower(): name for name in FORMATS if name.startswith(what)}
     keywords: dict[str, str] = {}
     kind = ""
     groups: list[str] = []
@@ -67,10 +67,10 @@ def _read(where: str, text: str, what: str) -> list[Segment]:
             if groups[-1] == BOUNDARIES and line:
                 boundaries_ns.append(_times_and_numbers(f"{where} line {number}", line)[0])
         elif not kind and key.startswith(what) and not value:
-            kind = known.get(key.lower(), "")
+            kind = formats.get(key.lower(), "")
             if not kind:
                 raise EmulatorError(
-                    f"{where}: format {key[:40]!r} is not read; known: {', '.join(known.values())}"
+                    f"{where}: format {key[:40]!r} is not read; known: {', '.join(formats.values())}"
                 )
             if keywords.get("timeformat", "EpSec") != "EpSec" or "scenarioepoch" not in keywords:
                 raise EmulatorError(f"{where}: needs a ScenarioEpoch and times in seconds (TimeFormat EpSec)")
@@ -80,7 +80,7 @@ def _read(where: str, text: str, what: str) -> list[Segment]:
             rows.append(_times_and_numbers(f"{where} line {number}", line))
     if not kind:
         raise EmulatorError(
-            f"{where}: no data of STK's kind {what!r}; known formats: {', '.join(known.values())}"
+            f"{where}: no data of STK's kind {what!r}; known formats: {', '.join(formats.values())}"
         )
     if what == "Ephemeris":
         factor = _kilometres(where, keywords.get("distanceunit", "meters").lower())

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.simulation.clock import Clock, make_clock
+from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
 from starhil.emulator.truth.feed import LiveFeed, Step
 from starhil.emulator.truth.live import LiveTruth
@@ -105,7 +106,7 @@ class Truth:
         """Return what `put` needs: read the file of the source, or open its socket."""
         host = self._host
         now_s = host.now_s() if at_s is None else at_s
-        source = await asyncio.to_thread(config.build, now_s, self._folder)
+        source = await in_thread(config.build, now_s, self._folder)
         live = at_s is None
         if (
             live
@@ -180,5 +181,4 @@ def seen_from(mount: Attitude | None, body: TruthState) -> TruthState:
 
 
 def _address(config: FeedConfig) -> str:
-    """Return the address of a feed as configured."""
     return f"{'udp' if config.socket == 'udp' else 'tcp'}:{config.host}:{config.port}"

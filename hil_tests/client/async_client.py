@@ -1,4 +1,4 @@
-"""An asynchronous OBC client, which uses the names of the interface definition."""
+"""Asynchronous OBC client; rows and fields have their names in the interface definition."""
 
 from __future__ import annotations
 
@@ -54,7 +54,6 @@ class AsyncObcClient:
         self.unsolicited: defaultdict[str, asyncio.Queue[Reading]] = defaultdict(
             lambda: asyncio.Queue(UNSOLICITED_KEPT)
         )
-        """Unsolicited readings by row."""
         self.unsolicited_dropped = 0
         self.bursts: asyncio.Queue[bytes] = asyncio.Queue()
         self._turn = asyncio.Lock()
@@ -191,8 +190,8 @@ class AsyncObcClient:
 
         Messages received before `since_s` (on `time.monotonic`) are dropped.
         """
-        wanted = self.icd.telemetry[name].name
-        queue = self.unsolicited[wanted]
+        row_name = self.icd.telemetry[name].name
+        queue = self.unsolicited[row_name]
         limit = self.timeout_s if timeout_s is None else timeout_s
         try:
             async with asyncio.timeout(limit):
@@ -201,7 +200,7 @@ class AsyncObcClient:
                     if reading.received_s >= since_s:
                         return reading
         except TimeoutError:
-            raise NoReplyError(f"unsolicited {wanted}", limit) from None
+            raise NoReplyError(f"unsolicited {row_name}", limit) from None
 
     # --- by row ID ---
 
@@ -278,7 +277,7 @@ class AsyncObcClient:
             row is not None
             and reply.kind is ReplyKind.TELEMETRY
             and (row.unsolicited is not None or self.icd.selects_unsolicited)
-            and not self.link.marks_unsolicited(reply.klass)
+            and not self.link.marks_unsolicited(reply.message_class)
         ):
             self._on_unsolicited(reply)
         else:
@@ -286,9 +285,9 @@ class AsyncObcClient:
 
     def _answers(self, request: Request, reply: Reply) -> bool:
         """Return whether a reply answers a request; a telecommand may be answered with a telemetry row."""
-        if reply.id is None or (reply.id, reply.klass) == (request.id, request.klass):
+        if reply.id is None or (reply.id, reply.message_class) == (request.id, request.message_class):
             return reply.kind in _ANSWERS[request.kind]
-        row, answer = self.icd.row(request.id, request.klass), self._row_of(reply)
+        row, answer = self.icd.row(request.id, request.message_class), self._row_of(reply)
         return row is not None and answer is not None and f"row:{answer.name}" in row.answers
 
     def _on_unsolicited(self, reply: Reply) -> None:
@@ -303,7 +302,7 @@ class AsyncObcClient:
             queue.put_nowait(self._reading(reply, 0.0))
 
     def _row_of(self, reply: Reply) -> Row | None:
-        return None if reply.id is None else self.icd.row(reply.id, reply.klass)
+        return None if reply.id is None else self.icd.row(reply.id, reply.message_class)
 
     def _reading(self, reply: Reply, latency: float) -> Reading:
         row = self._row_of(reply)

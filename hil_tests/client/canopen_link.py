@@ -38,7 +38,7 @@ class CanopenHostLink(HostLink[CanFrame]):
 
         Raises BenchError: the object dictionary does not hold the row.
         """
-        row = self._icd.row(request.id, request.klass)
+        row = self._icd.row(request.id, request.message_class)
         if row is None:
             raise BenchError(f"{self.description}: request {request.id} is not in the object dictionary")
         try:
@@ -66,10 +66,12 @@ class CanopenHostLink(HostLink[CanFrame]):
             self._send(transfer.send(frame.data.ljust(8, b"\0")))
         except StopIteration as done:
             kind = ReplyKind.ACK if request.kind is RequestKind.TELECOMMAND else ReplyKind.TELEMETRY
-            return self._reply(Reply(kind, request.id, done.value, klass=request.klass))
+            return self._reply(Reply(kind, request.id, done.value, message_class=request.message_class))
         except SdoAbortError as abort:
             code = self._icd.error_number(error_of(abort.code))
-            return self._reply(Reply(ReplyKind.NACK, request.id, code=code, klass=request.klass))
+            return self._reply(
+                Reply(ReplyKind.NACK, request.id, code=code, message_class=request.message_class)
+            )
         return []
 
     def flush(self, _now: float) -> list[LinkFault]:

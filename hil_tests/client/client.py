@@ -1,4 +1,4 @@
-"""A synchronous OBC client, which uses the names of the interface definition."""
+"""Synchronous OBC client; rows and fields have their names in the interface definition."""
 
 from __future__ import annotations
 
@@ -133,8 +133,13 @@ class ObcClient:
     download_image = _synchronous(download_image)
 
     def request(
-        self, identifier: int, data: bytes = b"", *, klass: str | None = None, timeout_s: float | None = None
+        self,
+        identifier: int,
+        data: bytes = b"",
+        *,
+        message_class: str | None = None,
+        timeout_s: float | None = None,
     ) -> Reply:
         """Send a request by row ID (and class, if the unit has classes), data as bytes; return the reply."""
-        request = self.icd.request_of(identifier, klass, data)
+        request = self.icd.request_of(identifier, message_class, data)
         return self.run(self.core.transact(request, f"request {identifier}", timeout_s=timeout_s))[0]

@@ -40,7 +40,6 @@ FILES_MAX: Final = 1000
 BURST_ROUNDS: Final = 20
 """Number of requests for the missing packets of a block."""
 BURST_SILENCE_S: Final = 0.5
-"""Silence that ends a burst."""
 
 
 @dataclass(frozen=True)

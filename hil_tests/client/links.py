@@ -72,11 +72,11 @@ class HostLink(ABC, Generic[Item]):
         """Return the answers of a row on this link; none if no reply may be awaited."""
         return row.answers
 
-    def marks_unsolicited(self, klass: str) -> bool:  # noqa: ARG002 -- on most links, all of it
+    def marks_unsolicited(self, message_class: str) -> bool:  # noqa: ARG002 -- on most links, all of it
         """Return whether unsolicited telemetry of a class says that it is."""
         return True
 
-    def is_from_device(self, item: Item) -> bool:  # noqa: ARG002 -- nobody else sends on a line
+    def is_from_device(self, item: Item) -> bool:  # noqa: ARG002 -- a serial line has only one peer
         """Return whether the device has sent a received item."""
         return True
 
@@ -157,9 +157,9 @@ class SerialHostLink(HostLink[bytes]):
         """Frame and send a request."""
         self.send(self._receiver.request(request))
 
-    def marks_unsolicited(self, klass: str) -> bool:
+    def marks_unsolicited(self, message_class: str) -> bool:
         """Return whether unsolicited telemetry of a class says that it is."""
-        return self._stack.marks_unsolicited(klass)
+        return self._stack.marks_unsolicited(message_class)
 
     def answers(self, row: Row) -> tuple[str, ...]:
         """Return the answers of a row on the serial line."""

@@ -1,4 +1,4 @@
-"""Sending of raw bytes or CAN frames, and comparison of the answer with a pattern."""
+"""Raw bytes and CAN frames as text, for sessions and conformance cases: parsing, sending, and comparing answers with patterns."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from starhil.hil_tests.errors import BenchError
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 
-_FRAME: Final = re.compile(r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(R|(?:[0-9A-Fa-f]{2}|\.\.){0,8})")
+_FRAME: Final = re.compile(r"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(R|(?:[0-9A-Fa-f]{2}|\.\.){0,8}\*?)")
 _POLL_S: Final = 0.02
-_BYTES: Final = re.compile(r"(?:[0-9A-F]{2}|\.\.)*")
+_BYTES: Final = re.compile(r"(?:[0-9A-F]{2}|\.\.)*\*?")
 
 
 def parse_frame(text: str) -> CanFrame:
@@ -26,7 +26,7 @@ def parse_frame(text: str) -> CanFrame:
     """
     compact = text.replace(" ", "")
     match = _FRAME.fullmatch(compact)
-    if match is None or ".." in compact:
+    if match is None or ".." in compact or "*" in compact:
         raise BenchError(f"not a CAN frame in the format of cansend: {text!r}")
     can_id, data = match.groups()
     try:
@@ -38,7 +38,7 @@ def parse_frame(text: str) -> CanFrame:
 
 
 def pattern(text: str) -> str:
-    """Normalise the pattern of an answer: capitals without blanks; `..` matches any byte.
+    """Normalise the pattern of an answer: capitals without blanks; `..` matches any byte, a final `*` any others.
 
     Raises BenchError: the text is neither hexadecimal bytes nor a frame.
     """
@@ -49,40 +49,41 @@ def pattern(text: str) -> str:
 
 
 def matches(expected: str, seen: str) -> bool:
-    """Return whether hexadecimal bytes or a frame match a pattern; `..` matches any byte."""
-    return re.fullmatch(expected.replace("..", "[0-9A-F]{2}"), seen) is not None
+    """Return whether hexadecimal bytes or a frame, in capitals, match a pattern."""
+    digits = "[0-9A-F]"
+    return re.fullmatch(expected.replace("..", f"{digits}{{2}}").replace("*", f"{digits}*"), seen) is not None
 
 
 async def send_and_listen(
     client: AsyncObcClient,
     items: Sequence[bytes | CanFrame],
     listen_s: float,
-    wanted: Sequence[str] = (),
+    patterns: Sequence[str] = (),
     timeout_s: float | None = None,
 ) -> tuple[str, ...]:
     """Send bytes (serial) or frames (CAN), and return the answer as one text of bytes, or as frames.
 
     Listens for `listen_s`, and for up to `timeout_s` (default: that of the client) until as much has arrived as the
-    patterns in `wanted` have.
+    patterns in `patterns` have.
     """
     link = client.link
-    size = len("".join(wanted))
+    size = len("".join(patterns).replace("*", ""))
     end = time.monotonic() + (client.timeout_s if timeout_s is None else timeout_s)
-    seen: list[Any] = []
-    before, link.on_raw = link.on_raw, seen.append
+    received: list[Any] = []
+    before, link.on_raw = link.on_raw, received.append
     try:
         for item in items:
             link.send(item)
         await asyncio.sleep(listen_s)
-        while len("".join(_format_received(link, seen))) < size and time.monotonic() < end:
+        while len("".join(_format_received(link, received))) < size and time.monotonic() < end:
             await asyncio.sleep(_POLL_S)
     finally:
         link.on_raw = before
-    return _format_received(link, seen)
+    return _format_received(link, received)
 
 
-def _format_received(link: HostLink[Any], seen: list[Any]) -> tuple[str, ...]:
+def _format_received(link: HostLink[Any], received: list[Any]) -> tuple[str, ...]:
     """Return one text of all bytes, or one per frame of the device."""
     if link.name == "serial":
-        return (b"".join(seen).hex().upper(),)
-    return tuple(str(frame) for frame in seen if link.is_from_device(frame))
+        return (b"".join(received).hex().upper(),)
+    return tuple(str(frame) for frame in received if link.is_from_device(frame))

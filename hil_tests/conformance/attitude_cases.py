@@ -1,4 +1,4 @@
-"""Cases on the attitudes in a row, on any link: |q| = 1, invalid in standby, one attitude in all forms, and the truth if it is given."""
+"""Attitude cases for any link: |q| = 1, invalid in standby, agreement of all forms, and of each with the truth if it is known."""
 
 from __future__ import annotations
 
@@ -57,11 +57,11 @@ class AttitudeRow:
         """Title of the case."""
         return f"{self.row.name} has one attitude in all forms if it is valid, and the true one"
 
-    def is_valid(self, seen: Mapping[str, Value]) -> bool:
+    def is_valid(self, values: Mapping[str, Value]) -> bool:
         """Return whether the flag, which may be the number 1, is set; without a flag, whether any number is not 0."""
         if self.flag is not None:
-            return seen[self.flag] == 1
-        return self._is_stated(seen)
+            return values[self.flag] == 1
+        return self._is_stated(values)
 
     def _is_stated(self, seen: Mapping[str, Value]) -> bool:
         return any(seen[item.name] for reading in self.readings for item in reading.fields)
@@ -72,9 +72,9 @@ class AttitudeRow:
         with identifying_stars(probe):
             if rest is not None and search is not None:
                 rest()
-                seen = probe.values(self.row)
+                values = probe.values(self.row)
                 check(
-                    not self.is_valid(seen),
+                    not self.is_valid(values),
                     "no valid attitude in standby (R11, docs/rules.md)",
                     "a valid one",
                 )
@@ -83,37 +83,37 @@ class AttitudeRow:
             if search is not None:
                 check_mode(probe, SEARCHING, TRACKING)
             end = probe.now() + ATTITUDE_S
-            while not self.is_valid(seen := probe.values(self.row)):
+            while not self.is_valid(values := probe.values(self.row)):
                 if probe.now() > end:
-                    self._check_flag(probe, seen)
+                    self._check_flag(probe, values)
                     raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
                 probe.sleep(0.1)
-            self.check(probe, seen)
+            self.check(probe, values)
             self._check_truth(probe)
 
-    def check(self, probe: Probe, seen: Mapping[str, Value]) -> None:
+    def check(self, probe: Probe, values: Mapping[str, Value]) -> None:
         """Fail the case if an attitude is valid in standby, of a wrong length, not the truth, or not that of other fields."""
-        if not self.is_valid(seen):
+        if not self.is_valid(values):
             return
         if in_standby(probe):
             still = self.is_valid(probe.values(self.row)) and in_standby(probe)
             check(not still, "no valid attitude in standby (R11, docs/rules.md)", "a valid one")
-        self._check_attitudes(probe, seen)
+        self._check_attitudes(probe, values)
 
-    def _check_attitudes(self, probe: Probe, seen: Mapping[str, Value]) -> None:
+    def _check_attitudes(self, probe: Probe, values: Mapping[str, Value]) -> None:
         """Compare the first attitude with the truth, and the others with both."""
-        known: list[tuple[str, Axes, float]] = []
+        others: list[tuple[str, Axes, float]] = []
         truth = None if probe.truth is None else probe.truth()
         for reading in self.readings:
-            axes = reading.axes(seen, self.conventions)
+            axes = reading.axes(values, self.conventions)
             true = [] if truth is None else [(self._stated(truth, reading), axes_of(truth), 0.0)]
-            for what, other, rounding_deg in (true + known)[:2]:
+            for what, other, rounding_deg in (true + others)[:2]:
                 error_deg = angle_deg(axes, other)
                 limit_deg = TRUTH_DEG + reading.rounding_deg + rounding_deg
-                numbers = tuple(round(float(seen[item.name]), 4) for item in reading.fields)
+                numbers = tuple(round(float(values[item.name]), 4) for item in reading.fields)
                 wanted = f"{what} in {reading}, to {limit_deg:.3g} deg"
                 check(error_deg <= limit_deg, wanted, f"{numbers}, {error_deg:.2f} deg off")
-            known.append((f"the attitude of {reading}", axes, reading.rounding_deg))
+            others.append((f"the attitude of {reading}", axes, reading.rounding_deg))
 
     def _stated(self, truth: Quaternion, reading: Reading) -> str:
         """Return the text of the true attitude: as a quaternion if the unit reports one, otherwise as angles."""
@@ -135,16 +135,16 @@ class AttitudeRow:
             reason = f"a conjugated attitude would pass too: at this truth it is only {error_deg:.2f} deg off"
             raise CaseSkipped(f"{reason}; point the unit elsewhere")
 
-    def _check_flag(self, probe: Probe, seen: Mapping[str, Value]) -> None:
+    def _check_flag(self, probe: Probe, values: Mapping[str, Value]) -> None:
         """Fail the case if the true attitude is reported, but never as valid."""
-        if self.flag is None or probe.truth is None or not self._is_stated(seen):
+        if self.flag is None or probe.truth is None or not self._is_stated(values):
             return
         try:
-            self._check_attitudes(probe, seen)
+            self._check_attitudes(probe, values)
         except CaseFailed:
             return
         wanted = f"{self.flag} set within {ATTITUDE_S:g} s, because the reported attitude is the true one"
-        raise CaseFailed(wanted, f"{self.flag} = {seen[self.flag]!r}")
+        raise CaseFailed(wanted, f"{self.flag} = {values[self.flag]!r}")
 
 
 def _mode_fields(probe: Probe) -> Iterator[tuple[Row, Field]]:
@@ -173,14 +173,14 @@ def check_mode(probe: Probe, commanded: str, *entered: str) -> None:
 
     A field that has no number for the commanded mode, or another mode's, is left out.
     """
-    wanted = (commanded, *entered)
+    modes = (commanded, *entered)
     for row, item in _mode_fields(probe):
         if commanded not in (item.enum or {}):
             continue
         end = probe.now() + MODE_S
-        while (seen := probe.values(row)[item.name]) not in wanted:
+        while (seen := probe.values(row)[item.name]) not in modes:
             within = f"within {MODE_S:g} s of the telecommand (R13, docs/rules.md)"
-            check(probe.now() < end, f"{item.name} of {row.name} {' or '.join(wanted)} {within}", seen)
+            check(probe.now() < end, f"{item.name} of {row.name} {' or '.join(modes)} {within}", seen)
             probe.sleep(0.1)
 
 

@@ -106,16 +106,16 @@ def _of(prefix: str, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(f"attitude.{prefix}{name}" for name in names)
 
 
-COUNTED: Final = ("[1]", "[2]", "[3]")
+AXES_FROM_1: Final = ("[1]", "[2]", "[3]")
 QUATERNION: Final = Form("quaternion", _of("", "xyzw"), _quaternion, (1.0, 1.0))
 VECTOR_PART: Final = Form("vector part", _of("", "xyz"), _quaternion, (0.0, 1.0))
 FORMS: Final = (
     QUATERNION,
     VECTOR_PART,
     Form("rotation vector", _of("rotation_", "xyz"), _rotation_vector, (0.0, math.pi)),
-    *(Form("matrix row", _of(f"dcm_{axis}", COUNTED), _matrix_row(number), (1.0, 1.0)) for number, axis in enumerate("xyz")),
+    *(Form("matrix row", _of(f"dcm_{axis}", AXES_FROM_1), _matrix_row(number), (1.0, 1.0)) for number, axis in enumerate("xyz")),
     *(
-        Form("Euler angles", _of(f"euler_{one}{two}{last}", COUNTED), _euler(one + two + last))
+        Form("Euler angles", _of(f"euler_{one}{two}{last}", AXES_FROM_1), _euler(one + two + last))
         for one, two, three in permutations("xyz") for last in (one, three)
     ),
     Form("RA, Dec and roll", _of("", ("ra", "dec", "roll")), _radec),

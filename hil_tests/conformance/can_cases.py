@@ -38,7 +38,8 @@ def can_names(unit: Unit) -> dict[str, str]:
     possible with a last one that is not full); of telecommands `empty` (may be sent at any time), `short`, `longest`,
     `refused` and `eight` (with a value that must be refused, the second of 8 bytes); without a row `unknown`,
     `unknown_telemetry`. `single_size`, `single_data`: size and data, which for telemetry are any. `m0` to `m4`: segments of
-    a message that is answered by `refusal`, and `t0` to `t4` from another host. Each error has its code.
+    a message that is answered by `refusal`, and `t0` to `t4` from another host. Each error has its code; `host` and
+    `device` stay in braces until the probe replaces them.
     """
     telemetry = [row for row in unit.readable.values() if row.answers == ("reply",)]
     commands = [row for row in unit.telecommands.values() if row.answers == ("reply",)]
@@ -54,32 +55,35 @@ def can_names(unit: Unit) -> dict[str, str]:
         "refused": (row for row in commands if row.id in faulty),
         "eight": (row for row in commands if row.id in faulty and row.size == 8),
     }
-    found = {name: f"{unit.code(name):02X}" for name in PUBLISHED}
+    names = {name: f"{unit.code(name):02X}" for name in PUBLISHED}
+    names |= {name: f"{{{name}}}" for name in ("host", "device")}
     for name, choices in rows.items():
         for row in list(choices)[:1]:
             data = ".." * row.size if row.is_telemetry else faulty.get(row.id, b"").hex().upper()
-            found |= {name: f"{row.id:02X}", f"{name}_size": str(row.size), f"{name}_data": data}
-    if "long" in found:
-        count, rest = divmod(int(found["long_size"]) - 1, 7)
-        found |= {"long_count": str(count + 1), "long_first": str(count), "long_rest": str(rest + 1)}
-        found["long_segments"] = _answer(found["long"], int(found["long_size"]))
-    if "longest" in found:
-        found["longest_of_500_bytes"] = " ".join(_message(found["longest"], bytes(500)))
-    if "eight" in found:
-        found["eight_in_segments"] = " ".join(_message(found["eight"], bytes.fromhex(found["eight_data"])))
+            names |= {name: f"{row.id:02X}", f"{name}_size": str(row.size), f"{name}_data": data}
+    if "long" in names:
+        count, rest = divmod(int(names["long_size"]) - 1, 7)
+        names |= {"long_count": str(count + 1), "long_first": str(count), "long_rest": str(rest + 1)}
+        names["long_segments"] = _answer(names["long"], int(names["long_size"]))
+    if "longest" in names:
+        names["longest_of_500_bytes"] = " ".join(_message(names["longest"], bytes(500)))
+    if "eight" in names:
+        names["eight_in_segments"] = " ".join(_message(names["eight"], bytes.fromhex(names["eight_data"])))
     unused = set(range(256)) - {row.id for row in unit.rows}
     for name, numbers in (("unknown", range(128)), ("unknown_telemetry", range(128, 256))):
         for number in sorted(unused.intersection(numbers))[:1]:
-            found[name] = f"{number:02X}"
-    if "unknown" in found:
-        parts = _message(found["unknown"], bytes(range(30)))
-        found |= {f"m{number}": part for number, part in enumerate(parts)}
-        found |= {f"t{number}": part.replace("HH", OTHER_HOST, 1) for number, part in enumerate(parts)}
-        found |= {"m": " ".join(parts), "m_of_1750_bytes": " ".join(_message(found["unknown"], bytes(1750)))}
-        found["refusal"] = f"03{found['unknown']}DDHH#{found['invalid_id']}"
+            names[name] = f"{number:02X}"
+    if "unknown" in names:
+        parts = _message(names["unknown"], bytes(range(30)))
+        names |= {f"m{number}": part for number, part in enumerate(parts)}
+        names |= {f"t{number}": part.replace("{host}", OTHER_HOST) for number, part in enumerate(parts)}
+        names |= {"m": " ".join(parts), "m_of_1750_bytes": " ".join(_message(names["unknown"], bytes(1750)))}
+        names["refusal"] = f"03{names['unknown']}{{device}}{{host}}#{names['invalid_id']}"
     answers = ((f"{row.id:02X}", row.size) for row in telemetry)
-    found["each_row"] = "; ".join(f"04{number}HHDD# > {_answer(number, size)}" for number, size in answers)
-    return found
+    names["each_row"] = "; ".join(
+        f"04{number}{{host}}{{device}}# > {_answer(number, size)}" for number, size in answers
+    )
+    return names
 
 
 def _bad_data(row: Row) -> list[bytes]:
@@ -87,16 +91,15 @@ def _bad_data(row: Row) -> list[bytes]:
 
 
 def _message(number: str, data: bytes) -> list[str]:
-    """Return the segments of a telecommand."""
-    return [f"07{number}HHDD#{part.hex().upper()}" for part in segments(data)]
+    return [f"07{number}{{host}}{{device}}#{part.hex().upper()}" for part in segments(data)]
 
 
 def _answer(number: str, size: int) -> str:
     """Return the pattern of telemetry, in one frame or in segments."""
     if size <= 8:
-        return f"05{number}DDHH#{'..' * size}"
+        return f"05{number}{{device}}{{host}}#{'..' * size}"
     parts = segments(bytes(size))
-    return " ".join(f"08{number}DDHH#{'..' * (len(part) - 1)}{part[-1]:02X}" for part in parts)
+    return " ".join(f"08{number}{{device}}{{host}}#{'..' * (len(part) - 1)}{part[-1]:02X}" for part in parts)
 
 
 def noise(probe: CanProbe) -> None:

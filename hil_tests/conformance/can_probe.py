@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from starhil.hil_tests.client.raw_traffic import matches, parse_frame, pattern
 from starhil.hil_tests.conformance.case import check
@@ -46,21 +46,20 @@ class CanProbe(LinkProbe):
         self.log.append(f"{self.now():.4f} -> {frame!s}")
         self.port.send(frame)
 
-    def exchange(self, sent: str, answers: Sequence[str]) -> None:
+    @property
+    def addresses(self) -> Mapping[str, str]:
+        """The addresses of tester and device, as in CAN IDs."""
+        return {"host": f"{self.host:02X}", "device": f"{self.device:02X}"}
+
+    def exchange(self, sent: Sequence[str], answers: Sequence[str]) -> None:
         """Send frames, and take frames that match the patterns."""
-        for text in sent.split():
-            self.send(parse_frame(self._with_addresses(text)))
+        for text in sent:
+            self.send(parse_frame(text))
         for answer in answers:
-            wanted = pattern(self._with_addresses(answer))
+            expected = pattern(answer)
             frame = self.next_frame()
             seen = "nothing" if frame is None else str(frame)
-            check(matches(wanted, seen), wanted, seen)
-
-    def _with_addresses(self, text: str) -> str:
-        """Replace HH and DD in the last two bytes of a CAN ID; the row before them may be 4D or DD."""
-        known = {"HH": f"{self.host:02X}", "DD": f"{self.device:02X}"}
-        source, destination = text[4:6], text[6:8]
-        return text[:4] + known.get(source, source) + known.get(destination, destination) + text[8:]
+            check(matches(expected, seen), expected, seen)
 
     def _receive(self, timeout_s: float) -> bool:
         frame = self.port.receive(timeout_s)

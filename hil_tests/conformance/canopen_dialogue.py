@@ -1,13 +1,12 @@
-"""Cases written as dialogues: what the master sends, and what the node must answer.
+"""Cases on CANopen that are written as text: requests to the node by SDO and LSS, frames, and verbs for the rest.
 
     40 {text} > *
     70 > abort TOGGLE {text}
     if 1003 kept 1003:0
 
-They are in files of cases (`case_file`), in areas with `links = ["canopen"]`; one step per line, `#` begins a comment.
-`REQUEST > ANSWER` sends bytes by SDO, padded to 8, and looks at
-the next frame of the node; without a request, it looks at the frame after that, and after `wait` for as long as a
-transfer may take to time out. An answer is one of
+The language is that of `dialogue`, and the cases are in areas with `links = ["canopen"]` of a file of cases (`case_file`).
+`REQUEST > ANSWER` sends bytes by SDO, padded to 8, and checks the next answer of the node; `> ANSWER` checks the one after
+that. An answer is one of
 
     60 {text} 00000000      these bytes; `..` is any byte, a final `*` any others
     abort A|B MUX           an abort with one of these codes, for this object if one is given
@@ -17,7 +16,12 @@ transfer may take to time out. An answer is one of
     silence, *, -           no answer; any answer or none; do not wait
     silence or abort A      one of several answers
 
-Other lines begin with a verb:
+Frames are sent as they are; of the answer, the next frame with its CAN ID is checked, which must arrive within 0.5 s:
+
+    000#03{node}            sends a frame; `080#R` a remote frame, `00000000#01` one with a CAN ID of 29 bits
+    > {tpdo_id}#2a..        takes a frame; {tpdo_id}#* one with any data
+
+The other steps begin with a verb:
 
     need 1016 1010:3, lacks 1800:4      skip the case if an object or entry is missing, or is there
     if 1019 LINE                the line, if the EDS has the object or entry
@@ -33,9 +37,7 @@ Other lines begin with a verb:
     nmt 1, nmt 1 all, nmt 1 other       an NMT command to the node, to all nodes, to another node
     reset, reset node, boot-up  reset of communication or node with its boot-up message; that message alone
     state 7f                    the next heartbeat, with this state
-    send 000 01 extended        a frame, with 29 bits of CAN ID or as a remote frame if so said
-    frame 181 2a00 0.5          the next frame with this CAN ID, with these bytes if any are given, within a time, s
-    event 181 2a00 3.0          the same; skip the case if none comes
+    event 181#2a00, event 181#2a00 3.0  a frame like this, within a time, s; skip the case if none comes
     none {heartbeat} 0.3 00     no frame with this CAN ID, or with this data too, within a time, s
     count 080 0.15 5 8          the number of frames in a time, s, and its limits
     counted 01 02, period 0.04 0.06     their data, from the first on; limits of their mean distance, s
@@ -47,27 +49,25 @@ Other lines begin with a verb:
     map {tpdo} 1 {constant} event_ms=20     configure a PDO: transmission type, mapping entries, and can_id, inhibit, event_ms, start
     off 1800                    disable the PDO with this communication record
     sync, sync 3                a SYNC, or one with a counter
-    sleep 0.2, drain, quiet     wait; forget what was received; PDOs and heartbeat off
+    quiet                       PDOs and heartbeat off
+    wait > ANSWER               an answer within as long as a transfer may take to time out
     clock, took 0.08 0.16       start of a time; its limits, s
     lss                         select the node by LSS, to which all further requests go; skip the case if it has none
     scan VENDOR PRODUCT REVISION SERIAL     Fastscan finds this identity
     node 2d                     the node has another node ID from now on
-    finally                     the lines from here on follow in any case, also if one before has failed
 
 Indices, CAN IDs and data are in hexadecimal. Names in braces are in `canopen_names`; all are found before the first request.
 """
 
 from __future__ import annotations
 
-import inspect
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
-from functools import cache, partial
+from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from string import Formatter
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
+from starhil.hil_tests.client.raw_traffic import matches, parse_frame, pattern
 from starhil.hil_tests.conformance.canopen_names import FINDERS, PARTS, TPDO, Names, default_id, provoke
 from starhil.hil_tests.conformance.canopen_probe import (
     ANSWER_S,
@@ -85,13 +85,11 @@ from starhil.hil_tests.conformance.canopen_probe import (
 )
 from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped, check, check_equal
 from starhil.hil_tests.conformance.case_file import text_cases
+from starhil.hil_tests.conformance.dialogue import Dialogue, Seconds, check_literal
 from starhil.hil_tests.judge.canopen import ABORT, HEARTBEAT, SDO_RESPONSE, SEGMENT, SYNC
-from starhil.protocol.errors import did_you_mean
 
 LONGEST_TIMEOUT_S: Final = 12.0
 """Maximum time in which a node aborts a transfer whose client stops sending."""
-SHOWN_STEPS: Final = 4
-"""Number of steps before a failed one in its message."""
 NEEDED: Final = {"emcy": "emcy_id", "cause": "error", "fill-history": "error", "lss": "vendor"}
 """Verb → name that it needs, found before the first request too."""
 ANSWERS: Final = {"abort", "unless", "segment", "block", "silence", "*", "-"}
@@ -146,205 +144,128 @@ Bytes = Annotated[bytes, bytes.fromhex]
 Entry = Annotated[tuple[int, int], _entry]
 Item = Annotated[str, _item]
 Objects = Annotated[tuple[str, int], _object]
+Frame = Annotated[str, pattern]
 Aborts = Annotated[tuple[int, ...], _aborts]
 
 
-@cache
-def _parameters(verb: str) -> inspect.Signature:
-    return inspect.signature(getattr(_Master, verb), eval_str=True)
-
-
-def _call(verb: str, words: Sequence[str], refused: str) -> inspect.BoundArguments:
-    """Read the words behind a verb; words with names in braces remain texts.
-
-    Raises ValueError, TypeError, LookupError: a word is wrong, missing or too much.
-    """
-    if refused and "refused" not in _parameters(verb).parameters:
-        raise ValueError("nothing may follow >")
-    call = _parameters(verb).bind(None, *words, **({"refused": refused} if refused else {}))
-    for name, given in call.arguments.items():
-        kind = call.signature.parameters[name].annotation
-        if isinstance(given, tuple):
-            call.arguments[name] = tuple(_read(word, kind) for word in given)
-        elif given is not None:
-            call.arguments[name] = _read(given, kind)
-    return call
-
-
-def _read(word: str, kind: Any) -> Any:
-    return word if "{" in word else getattr(kind, "__metadata__", [kind])[0](word)
-
-
-def _parts(line: str) -> tuple[str, list[str], str]:
-    """Return the verb of a line, empty for a request; its words; and what follows `>`."""
-    head, _, answer = (part.strip() for part in line.partition(">"))
-    words = head.split()
-    verb = words[0].replace("-", "_") if words else ""
-    if not verb.startswith("_") and hasattr(_Master, verb):
-        return verb, words[1:], answer
-    return "", words, answer
-
-
-def _lines(text: str) -> list[tuple[int, str]]:
-    """Return the lines of a dialogue with their numbers, without comments and empty lines."""
-    lines = ((number, line.partition("#")[0].split(";")) for number, line in enumerate(text.splitlines(), 1))
-    return [(number, step.strip()) for number, steps in lines for step in steps if step.strip()]
-
-
-def _faults(line: str) -> Iterator[str]:
-    try:
-        if line.startswith("if "):
-            _, needed, line = line.split(maxsplit=2)
-            _read(needed, Item)
-        for name in {name for _, name, _, _ in Formatter().parse(line) if name is not None} - FINDERS.keys():
-            yield f"unknown name {name!r}{did_you_mean(name, FINDERS)}"
-        verb, words, answer = _parts(line)
-        if verb:
-            _call(verb, words, answer)
-            if verb in ("set", "holds") and "{" not in line:
-                _data_of(*words[1:3])
-        elif line != "finally":
-            yield from _faults_of_request(words, answer)
-    except (ValueError, TypeError, LookupError, OverflowError) as error:
-        yield f"{line}: {error}"
-
-
-def _faults_of_request(words: Sequence[str], answer: str) -> Iterator[str]:
-    try:
-        bytes.fromhex("".join(word for word in words if "{" not in word and words != ["wait"]))
-    except ValueError:
-        verbs = [name.replace("_", "-") for name in vars(_Master) if not name.startswith("_")]
-        yield f"unknown verb {words[0]!r}{did_you_mean(words[0], verbs)}"
-        return
-    for wanted in answer.removeprefix("unless ").split(" or "):
-        kind, *details = wanted.split() or [""]
+def _answer(text: str) -> str:
+    """Check what may follow `>`: one or several answers, separated by `or`."""
+    for answer in text.removeprefix("unless ").split(" or "):
+        kind, *details = answer.split() or [""]
+        if not kind or (kind == "abort" and not details):
+            raise ValueError("an answer or the code of an abort is missing")
         if kind == "abort":
             _aborts(details[0])
-        elif kind not in ANSWERS and not re.fullmatch(
-            r"([0-9a-f]{2}|\.\.|\{\w+\}|\*$)+", wanted.replace(" ", "")
-        ):
-            yield f"unknown answer {wanted!r}"
+        elif kind not in ANSWERS:
+            check_literal(answer, answer=True)
+    return text
 
 
-# --- holding a dialogue ---
+Answer = Annotated[str, _answer]
 
 
-def dialogue_cases(path: Path) -> list[Case[CanopenProbe]]:
-    """Return the cases on CANopen in a file of cases.
-
-    Raises BenchError: the file cannot be read, or has errors; one line for each.
-    """
-    return text_cases(path, "canopen", _Later(), _hold, _faults_of_dialogue)
+# --- holding a case ---
 
 
-class _Later(dict[str, str]):
-    """Names in braces, which remain until the dialogue is held."""
-
-    def __missing__(self, name: str) -> str:
-        return f"{{{name}}}"
-
-
-def _faults_of_dialogue(text: str) -> list[str]:
-    return [f"line {number}: {fault}" for number, line in _lines(text) for fault in _faults(line)]
-
-
-def _hold(text: str, probe: CanopenProbe) -> None:
-    lines = [line for _, line in _lines(text)]
-    for line in lines:
-        if line.startswith("need "):
-            probe.require(*line.split()[1:])
-    names = Names(probe)
-    words = [word for line in lines for word in line.split()]
-    for name in (name for verb, name in NEEDED.items() if verb in words):
-        names[name]
-    steps = [line.format_map(names) for line in lines]
-    last = steps.index("finally") if "finally" in steps else len(steps)
-    master = _Master(probe, names)
-    try:
-        master(steps[:last])
-    except BaseException:
-        with suppress(CaseFailed):
-            master(steps[last + 1 :])
-        raise
-    master(steps[last + 1 :])
-
-
-def _check(seen: bytes | None, wanted: str) -> None:
-    """Check the answer to a request."""
-    kind, *details = wanted.split()
+def _check(response: bytes | None, answer: str) -> None:
+    kind, *details = answer.split()
     match kind:
         case "silence":
-            check(seen is None, "no answer", seen or "an empty frame")
+            check(response is None, "no answer", response or "an empty frame")
         case "abort":
-            check_abort(seen, *_aborts(details[0]), multiplexer="".join(details[1:]))
+            check_abort(response, *_aborts(details[0]), multiplexer="".join(details[1:]))
         case "segment":
             number, *data = details
-            check(seen is not None, f"segment {number} of the block", seen)
-            check_equal((seen or b"\0")[0] & 0x7F, int(number), "segment number")
+            check(response is not None, f"segment {number} of the block", response)
+            check_equal((response or b"\0")[0] & 0x7F, int(number), "segment number")
             if data:
-                check_equal((seen or b"")[1:], bytes.fromhex("".join(data)), "data of the segment")
+                check_equal((response or b"")[1:], bytes.fromhex("".join(data)), "data of the segment")
         case "block":
-            check(seen is not None and seen[0] & 0xFB == 0xA0, "answer A0h or A4h", seen)
-            check_equal((seen or b"")[1:4].hex(), details[0], "multiplexer")
-            check(1 <= (seen or bytes(5))[4] <= 127, "block size 1 to 127", seen)
+            check(response is not None and response[0] & 0xFB == 0xA0, "answer A0h or A4h", response)
+            check_equal((response or b"")[1:4].hex(), details[0], "multiplexer")
+            check(1 <= (response or bytes(5))[4] <= 127, "block size 1 to 127", response)
         case "*" | "-":
             pass
         case _:
-            check_answer(seen, wanted)
+            check_answer(response, answer)
 
 
-class _Master:
-    """The verbs of a dialogue, whose `-` is a `_` here; words are read as their types demand."""
+class CanopenDialogue(Dialogue[CanopenProbe]):
+    """A case on CANopen."""
 
-    def __init__(self, probe: CanopenProbe, names: Names) -> None:
-        self._probe, self._names = probe, names
+    def __init__(self, probe: CanopenProbe) -> None:
+        super().__init__(probe)
+        self._names = Names(probe)
         self._has_lss, self._began = False, 0.0
         self._noted: dict[tuple[int, int], bytes] = {}
         self._counted: list[tuple[float, bytes]] = []
         self._emergency = b""
 
-    def __call__(self, steps: Sequence[str]) -> None:
-        """Take steps until one ends the dialogue."""
-        for number, step in enumerate(steps):
-            try:
-                if self._ends(step):
-                    return
-            except CaseFailed as failure:
-                before = (
-                    f", after {'; '.join(steps[max(0, number - SHOWN_STEPS) : number])}" if number else ""
-                )
-                raise CaseFailed(
-                    f"{failure.expected} (step {number + 1}: {step}{before})", failure.seen
-                ) from None
+    @classmethod
+    def _check_step(cls, step: str) -> None:
+        if step.startswith("if "):
+            _, needed, step = step.split(maxsplit=2)
+            if "{" not in needed:
+                _item(needed)
+        super()._check_step(step)
+        verb, words, _ = cls._parts(step)
+        if verb in ("do_set", "do_holds") and "{" not in step:
+            _data_of(*words[1:3])
 
-    def _ends(self, line: str) -> bool:
-        """Do what a line says, and check the answer; return whether the dialogue ends with it."""
-        if line.startswith("if "):
-            _, needed, line = line.split(maxsplit=2)
+    @classmethod
+    def _check_answer(cls, words: Sequence[str], answer: str) -> None:
+        if answer or not any("#" in word for word in words):
+            _answer(answer)
+
+    def _find_names(self, steps: Sequence[str]) -> Mapping[str, str]:
+        for step in steps:
+            if step.startswith("need "):
+                self._probe.require(*step.split()[1:])
+        words = [word for step in steps for word in step.split()]
+        for name in (name for verb, name in NEEDED.items() if verb in words):
+            self._names[name]
+        return self._names
+
+    def _ends_with(self, step: str) -> bool:
+        if step.startswith("if "):
+            _, needed, step = step.split(maxsplit=2)
             if self._probe.lacks(needed):
                 return False
-        verb, words, answer = _parts(line)
-        if verb:
-            call = _call(verb, words, answer)
-            getattr(self, verb)(*call.args[1:], **call.kwargs)
+        return super()._ends_with(step)
+
+    def _exchange(self, words: Sequence[str], answer: str) -> bool:
+        """Send a request or frames, and check the answer."""
+        frames = [parse_frame(word) for word in words if "#" in word]
+        for frame in frames:
+            self._probe.send_frame(frame)
+        if frames and not answer:
             return False
-        waits = words == ["wait"]
-        timeout_s = {"silence": 0.1, "-": 0.0}.get(answer, LONGEST_TIMEOUT_S if waits else ANSWER_S)
-        seen = self._ask(b"" if waits else bytes.fromhex("".join(words)), timeout_s)
+        if "#" in answer:
+            self._expect_frame(answer)
+            return False
+        timeout_s = {"silence": 0.1, "-": 0.0}.get(answer, ANSWER_S)
+        return self._judge(self._ask(bytes.fromhex("".join(words)), timeout_s), answer)
+
+    def _expect_frame(self, frame: str) -> None:
+        data = self._probe.expect(int(frame.partition("#")[0], 16), "frame")
+        check(_is_frame(frame, data), f"frame {frame}", data)
+
+    def _judge(self, data: bytes | None, answer: str) -> bool:
+        """Check an answer of the node; return whether the dialogue ends with it."""
         is_optional = answer.startswith("unless ")
-        if is_optional and seen is not None and seen[0] != ABORT:
+        if is_optional and data is not None and data[0] != ABORT:
             return False
         failures = []
-        for wanted in answer.removeprefix("unless ").split(" or "):
+        for alternative in answer.removeprefix("unless ").split(" or "):
             try:
-                _check(seen, wanted)
+                _check(data, alternative)
             except CaseFailed as failure:
                 failures.append(failure)
             else:
                 return is_optional
         raise CaseFailed(" or ".join(failure.expected for failure in failures), failures[0].seen)
 
-    def _ask(self, data: bytes, timeout_s: float = ANSWER_S) -> bytes | None:
+    def _ask(self, data: bytes, timeout_s: Seconds = ANSWER_S) -> bytes | None:
         """Send a request, unless it is empty, to the SDO server or by LSS; return the next answer within a time."""
         if data and self._has_lss:
             self._probe.send(LSS_TO_SLAVE, data.ljust(8, b"\0"))
@@ -355,109 +276,101 @@ class _Master:
 
     # Entries
 
-    def need(self, *_entries: Item) -> None:
+    def do_need(self, *_entries: Item) -> None:
         pass  # checked before the dialogue
 
-    def lacks(self, *entries: Item) -> None:
+    def do_lacks(self, *entries: Item) -> None:
         for item in entries:
             if not self._probe.lacks(item):
                 raise CaseSkipped(f"the EDS has {item}")
 
-    def set(self, entry: Entry, values: str, kind: str = "", *, refused: Aborts = ()) -> None:
+    def do_set(self, entry: Entry, values: str, kind: str = "", *, refused: Aborts = ()) -> None:
         for data in _data_of(values, kind):
             if refused:
                 self._probe.expect_refusal(*entry, data, *refused)
             else:
                 self._probe.set(*entry, data)
 
-    def read(self, entry: Entry, *, refused: Aborts = ()) -> None:
+    def do_read(self, entry: Entry, *, refused: Aborts = ()) -> None:
         if refused:
             self._probe.expect_unreadable(*entry, *refused)
         else:
             self._probe.read(*entry)
 
-    def holds(self, entry: Entry, value: str, kind: str = "", mask: Number = -1) -> None:
+    def do_holds(self, entry: Entry, value: str, kind: str = "", mask: Number = -1) -> None:
         both = self._probe.read(*entry), *_data_of(value, kind)
         numbers = [int.from_bytes(data, "little", signed=kind[:1] == "i") & mask for data in both]
         seen, wanted = numbers if kind[:1] in ("u", "i") else both
         check_equal(seen, wanted, _name(entry))
 
-    def default(self, entry: Entry) -> None:
+    def do_default(self, entry: Entry) -> None:
         item = self._probe.od.get_variable(*entry)
         check_equal(self._probe.number(*entry), 0 if item is None else item.default, _name(entry))
 
-    def note(self, entry: Entry) -> None:
+    def do_note(self, entry: Entry) -> None:
         self._noted[entry] = self._probe.read(*entry)
 
-    def kept(self, entry: Entry) -> None:
+    def do_kept(self, entry: Entry) -> None:
         check_equal(self._probe.read(*entry), self._noted[entry], f"{_name(entry)}, as before:")
 
     # Long transfers
 
-    def segments(self, value: Bytes) -> None:
+    def do_segments(self, value: Bytes) -> None:
         for start in range(0, len(value), SEGMENT):
             data, toggle = value[start : start + SEGMENT], 0x10 * (start // SEGMENT % 2)
             head = toggle | SEGMENT - len(data) << 1 | (start + SEGMENT >= len(value))
             check_answer(self._ask(bytes([0x60 | toggle])), f"{head:02x}{data.hex()}*")
 
-    def upload(self, mux: Bytes, block: Number, value: Bytes = b"", crc: str = "") -> None:
+    def do_upload(self, mux: Bytes, block: Number, value: Bytes = b"", crc: str = "") -> None:
         seen = self._probe.upload_blocks(mux, block, crc=crc != "no-crc")
         if value:
             check_equal(seen, value, "value")
 
     # States
 
-    def nmt(self, command: Number, whom: str = "") -> None:
+    def do_nmt(self, command: Number, whom: str = "") -> None:
         node = {"all": 0, "other": self._probe.node % 127 + 1}.get(whom)
         self._probe.nmt(command, node)
 
-    def reset(self, whom: str = "") -> None:
+    def do_reset(self, whom: str = "") -> None:
         self._probe.drain()
         self._probe.nmt(RESET_NODE if whom == "node" else RESET_COMMUNICATION)
         self._probe.expect_boot_up()
 
-    def boot_up(self) -> None:
+    def do_boot_up(self) -> None:
         self._probe.expect_boot_up()
 
-    def state(self, wanted: str) -> None:
-        check_equal(f"{self._probe.state():02x}", wanted, "state")
+    def do_state(self, state: str) -> None:
+        check_equal(f"{self._probe.state():02x}", state, "state")
 
-    def node(self, number: Hex) -> None:
+    def do_node(self, number: Hex) -> None:
         self._probe.node = number
 
-    def guard(self, wanted: str = "") -> None:
+    def do_guard(self, states: str = "") -> None:
         can_id = HEARTBEAT + self._probe.node
         self._probe.send(can_id, remote=True)
-        if wanted:
+        if states:
             seen = self._probe.expect(can_id, "answer to node guarding").hex()
-            check(seen in wanted.split("|"), f"answer {wanted} to node guarding", seen)
+            check(seen in states.split("|"), f"answer {states} to node guarding", seen)
         else:
             self._probe.expect_silence(can_id, "answer to node guarding", 0.2)
 
-    def watched(self) -> None:
+    def do_watched(self) -> None:
         self._probe.send_watched_heartbeat()
 
     # Frames
 
-    def send(self, can_id: Hex, *content: str) -> None:
-        data = "".join(word for word in content if word not in ("extended", "remote"))
-        self._probe.send(can_id, data, extended="extended" in content, remote="remote" in content)
-
-    def frame(self, can_id: Hex, data: Bytes = b"", within_s: float = ANSWER_S) -> None:
-        seen = self._probe.expect(can_id, "frame", within_s)
-        check(data in (b"", seen), f"data {data.hex(' ')}", seen)
-
-    def event(self, can_id: Hex, data: Bytes, within_s: float = ANSWER_S) -> None:
-        seen = self._probe.wait_for(can_id, within_s)
+    def do_event(self, frame: Frame, within_s: Seconds = ANSWER_S) -> None:
+        seen = self._probe.wait_for(int(frame.partition("#")[0], 16), within_s)
         if seen is None:
             raise CaseSkipped("a write to a mapped object is not an event on this device")
-        check_equal(seen, data, "data")
+        check(_is_frame(frame, seen), f"frame {frame}", seen)
 
-    def none(self, can_id: Hex, for_s: float = 0.1, data: Bytes = b"") -> None:
+    def do_none(self, can_id: Hex, for_s: Seconds = 0.1, data: Bytes = b"") -> None:
         seen = self._probe.wait_for(can_id, for_s, lambda seen: data in (b"", seen))
         check(seen is None, f"no frame with CAN ID 0x{can_id:03X}", seen or "an empty frame")
 
-    def count(self, can_id: Hex, for_s: float, least: Number, most: Number) -> None:
+    def do_count(self, can_id: Hex, for_s: Seconds, least: Number, most: Number) -> None:
         self._counted = self._probe.count(can_id, for_s)
         number = len(self._counted)
         check(
@@ -466,71 +379,68 @@ class _Master:
             number,
         )
 
-    def counted(self, *data: Bytes) -> None:
+    def do_counted(self, *data: Bytes) -> None:
         seen = [item.hex() for _, item in self._counted[: len(data)]]
         check_equal(seen, [item.hex() for item in data], "data")
 
-    def period(self, least: float, most: float) -> None:
+    def do_period(self, least: Seconds, most: Seconds) -> None:
         mean = (self._counted[-1][0] - self._counted[0][0]) / (len(self._counted) - 1)
         check(least <= mean <= most, f"a period of {least:g} to {most:g} s", f"{mean:.4f} s")
 
-    def sync(self, *counter: Number) -> None:
+    def do_sync(self, *counter: Number) -> None:
         self._probe.send(SYNC, bytes(counter))
 
-    def drain(self) -> None:
-        self._probe.drain()
-
-    def quiet(self) -> None:
+    def do_quiet(self) -> None:
         self._probe.quiet()
 
-    def sleep(self, seconds: float) -> None:
-        self._probe.sleep(seconds)
+    def do_wait(self, *, answer: Answer) -> bool:
+        return self._judge(self._ask(b"", LONGEST_TIMEOUT_S), answer)
 
-    def clock(self) -> None:
+    def do_clock(self) -> None:
         self._began = self._probe.now()
 
-    def took(self, least: float, most: float) -> None:
+    def do_took(self, least: Seconds, most: Seconds) -> None:
         seconds = self._probe.now() - self._began
         check(least <= seconds <= most, f"after {least:g} to {most:g} s", f"{seconds:.3f} s")
 
     # EMCY
 
-    def emcy(self, code: Hex, within_s: float = ANSWER_S) -> None:
+    def do_emcy(self, code: Hex, within_s: Seconds = ANSWER_S) -> None:
         can_id = int(self._names["emcy_id"], 16)
         self._emergency = self._probe.expect(can_id, f"EMCY {code:04X}h", within_s)
         check_equal(len(self._emergency), 8, "bytes of EMCY")
         check_equal(self._emergency[:2], code.to_bytes(2, "little"), "error code")
 
-    def register(self, bits: Hex) -> None:
+    def do_register(self, bits: Hex) -> None:
         seen = self._emergency[2]
         check(seen & bits if bits else not seen, f"error register {bits:02x}", f"{seen:02x}")
         check_equal(self._probe.number(0x1001), seen, "1001h")
 
-    def cause(self) -> None:
+    def do_cause(self) -> None:
         provoke(self._probe, int(self._names["error"], 16))
 
-    def clear(self) -> None:
+    def do_clear(self) -> None:
         provoke(self._probe, int(self._names["error"], 16), b"")
 
-    def fill_history(self) -> None:
+    def do_fill_history(self) -> None:
         code = int(self._names["error"], 16)
         length = max(self._probe.od.indices[0x1003].subindices)
         for number in range(1, length + 3):
-            self.cause()
-            self.emcy(code)
+            self.do_cause()
+            self.do_emcy(code)
             check_equal(self._probe.number(0x1003, 0), min(number, length), "errors")
             check_equal(self._probe.number(0x1003, 1) & 0xFFFF, code, "newest error")
-            self.clear()
-            self.emcy(0)
+            self.do_clear()
+            self.do_emcy(0)
 
     # PDOs
 
-    def map(self, index: Hex, kind: Number, *words: Objects) -> None:
+    def do_map(self, index: Hex, kind: Number, *words: Objects) -> None:
         """Configure a PDO by the procedure of CiA 301; other PDOs and the heartbeat are off."""
-        probe, given = self._probe, dict(words)
+        probe, settings = self._probe, dict(words)
         objects = [number for name, number in words if not name]
         flags = NO_RTR if index >= TPDO else 0
-        can_id = flags | given.get("can_id", default_id(index, probe.node))
+        can_id = flags | settings.get("can_id", default_id(index, probe.node))
         probe.quiet()
         probe.set(index, 1, PDO_OFF | can_id)
         probe.set(index + 0x200, 0, 0, 1)
@@ -539,9 +449,9 @@ class _Master:
         probe.set(index + 0x200, 0, len(objects), 1)
         probe.set(index, 2, kind, 1)
         for subindex, setting, size in (
-            (3, given.get("inhibit", 0), 2),
-            (5, given.get("event_ms", 0), 2),
-            (6, given.get("start"), 1),
+            (3, settings.get("inhibit", 0), 2),
+            (5, settings.get("event_ms", 0), 2),
+            (6, settings.get("start"), 1),
         ):
             served = not probe.lacks(f"{index:x}:{subindex}")
             if setting and not served:
@@ -551,12 +461,12 @@ class _Master:
         probe.set(index, 1, can_id)
         probe.drain()
 
-    def off(self, index: Hex) -> None:
+    def do_off(self, index: Hex) -> None:
         self._probe.disable_pdo(index)
 
     # LSS
 
-    def lss(self) -> None:
+    def do_lss(self) -> None:
         if not self._probe.od.device_information.LSS_supported:
             raise CaseSkipped("the EDS has no LSS")
         identity = [bytes.fromhex(self._names[part]) for part in PARTS]
@@ -564,15 +474,28 @@ class _Master:
         answer = [self._ask(bytes([command]) + part, 0.1) for command, part in enumerate(identity, 0x40)][-1]
         check_equal(answer, b"\x44" + bytes(7), "answer to switch state selective")
 
-    def scan(self, *identity: Bytes) -> None:
+    def do_scan(self, *identity: Bytes) -> None:
         def ask(number: int, bit: int, part: int, following: int) -> bool:
             data = b"\x51" + number.to_bytes(4, "little") + bytes([bit, part, following])
             return self._ask(data, 0.03) is not None
 
         check(ask(0, 0x80, 0, 0), "an answer to the start of Fastscan", None)
-        for part, wanted in enumerate(identity):
+        for part, value in enumerate(identity):
             number = 0
             for bit in reversed(range(32)):
                 number |= (not ask(number, bit, part, part)) << bit
-            check_equal(number.to_bytes(4, "little"), wanted, f"part {part + 1} of the identity")
+            check_equal(number.to_bytes(4, "little"), value, f"part {part + 1} of the identity")
             check(ask(number, 0, part, (part + 1) % 4), f"part {part + 1} of the identity confirmed", None)
+
+
+def _is_frame(frame: str, data: bytes) -> bool:
+    """Return whether a frame with the CAN ID of a pattern has the data of the pattern."""
+    return matches(pattern(frame).partition("#")[2], data.hex().upper())
+
+
+def dialogue_cases(path: Path) -> list[Case[CanopenProbe]]:
+    """Return the cases on CANopen in a file of cases.
+
+    Raises BenchError: the file cannot be read, or has errors; one line for each.
+    """
+    return text_cases(path, "canopen", {name: f"{{{name}}}" for name in FINDERS}, CanopenDialogue)

@@ -16,7 +16,7 @@ EDS: Final = CaseArea[CanopenProbe]("eds", "CiA 306 4.5")
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 ACCESS: Final = {"ro", "rw", "wo", "const", "rwr", "rww"}
 LISTS: Final = ("MandatoryObjects", "OptionalObjects", "ManufacturerObjects")
-RESTRICTED: Final = (
+RESTRICTED_IDS: Final = (
     (0, 0x7F),
     (0x101, 0x180),
     (0x581, 0x5FF),
@@ -145,7 +145,7 @@ def cob_ids(probe: CanopenProbe) -> None:
         if item is None or item.default is None or (index >= 0x1014 and item.default >> 31):
             continue
         can_id = item.default & 0x1FFFFFFF
-        restricted = any(low <= can_id <= high for low, high in RESTRICTED)
+        restricted = any(low <= can_id <= high for low, high in RESTRICTED_IDS)
         check(not restricted, f"CAN ID of {index:04X}h allowed", f"0x{can_id:03X}")
         check(can_id not in used, f"CAN ID of {index:04X}h is unique", used.get(can_id))
         used[can_id] = f"0x{can_id:03X} belongs to {index:04X}h"

@@ -1,7 +1,7 @@
-"""Names in braces of a dialogue: objects of the node that fit a purpose, their values, and CAN IDs.
+"""Names in braces of a dialogue: suitable objects of the node, their values, and CAN IDs.
 
-Names that belong together are found together, before the first request of the dialogue; a case whose names the EDS
-has no object for is skipped. Multiplexers, data and CAN IDs are in hexadecimal, mapping entries with `0x`.
+Related names are found together, before the first request of the dialogue; if the EDS has no object for one of them, the
+case is skipped. Multiplexers, data and CAN IDs are in hexadecimal, mapping entries with `0x`.
 """
 
 from __future__ import annotations
@@ -80,7 +80,6 @@ def _entry(item: ODVariable) -> str:
 
 
 def _mapping(item: ODVariable) -> str:
-    """Return the mapping entry of a variable."""
     return f"0x{item.index:04x}{item.subindex:02x}{8 * (size_of(item) or 0):02x}"
 
 
@@ -157,18 +156,18 @@ def _text(probe: CanopenProbe) -> dict[str, str]:
 
     With its second segment, and the largest threshold at which its block upload may become a segmented one.
     """
-    found: tuple[ODVariable, bytes] | None = None
+    text: tuple[ODVariable, bytes] | None = None
     for item in probe.variables():
         value = (
             probe.try_read(item.index, item.subindex) if item.data_type in TEXTS and item.readable else b""
         )
-        if isinstance(value, bytes) and len(value) >= (14 if found is None else 15):
-            found = item, value
+        if isinstance(value, bytes) and len(value) >= (14 if text is None else 15):
+            text = item, value
             if len(value) > 14:
                 break
-    if found is None:
+    if text is None:
         raise CaseSkipped("no readable text of 14 bytes or more")
-    item, value = found
+    item, value = text
     return {
         "text": _mux(item), "text_value": value.hex(), "text_size": len(value).to_bytes(4, "little").hex(),
         "text_second": value[7:14].hex(), "text_threshold": f"{min(255, len(value)):02x}",

@@ -11,7 +11,7 @@ from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, enc
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 
 OD: Final = CaseArea[CanopenProbe]("od", "CiA 301 7.2.4.3.17", intrusive=True)
-NOT_NOW = {Abort.NO_DATA, Abort.GENERAL, Abort.DEVICE_STATE, Abort.NOT_STORED}
+NO_VALUE_ABORTS = {Abort.NO_DATA, Abort.GENERAL, Abort.DEVICE_STATE, Abort.NOT_STORED}
 """Aborts which show that an object exists but has no value at present."""
 
 
@@ -20,12 +20,12 @@ def _readable(indices: range, probe: CanopenProbe) -> None:
     for item in probe.variables():
         if item.index not in indices or not item.readable or item.data_type == datatypes.DOMAIN:
             continue
-        seen = probe.try_read(item.index, item.subindex)
+        result = probe.try_read(item.index, item.subindex)
         where = f"{item.index:04X}h:{item.subindex:02X}h"
-        if isinstance(seen, int):
-            check(seen in NOT_NOW, f"{where} ({item.qualname}) read", f"abort 0x{seen:08X}")
+        if isinstance(result, int):
+            check(result in NO_VALUE_ABORTS, f"{where} ({item.qualname}) read", f"abort 0x{result:08X}")
         elif size_of(item) is not None:
-            check_equal(len(seen), size_of(item), f"bytes of {where} ({item.qualname})")
+            check_equal(len(result), size_of(item), f"bytes of {where} ({item.qualname})")
 
 
 for _name, _what, _clause, _indices in (
@@ -167,7 +167,7 @@ for _name, _word, _step, _code in (
 
 @OD.case("write-back", "a written value is read back", "CiA 301 7.2.4.3")
 def write_back(probe: CanopenProbe) -> None:
-    found = 0
+    written = 0
     for item in probe.variables():
         bounded = is_integer(item) and item.min is not None and item.max is not None
         if item.index < 0x2000 or item.access_type != "rw" or not bounded or size_of(item) not in {1, 2, 4}:
@@ -176,8 +176,8 @@ def write_back(probe: CanopenProbe) -> None:
         for limit in (item.min, item.max):
             data = encoded(item, int(limit or 0))
             if probe.write(item.index, item.subindex, data) == 0:
-                found += 1
+                written += 1
                 check_equal(probe.value(item), data, f"{item.qualname}")
         probe.put(item, before)
-    if not found:
+    if not written:
         raise CaseSkipped("the EDS has no object that accepts its limits")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from binascii import crc_hqx
 from collections.abc import Callable, Collection, Iterable
 from enum import IntEnum
@@ -10,6 +9,7 @@ from typing import Any, Final, TypeVar
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
+from starhil.hil_tests.client.raw_traffic import matches, pattern
 from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, Probe, check, check_equal
 from starhil.hil_tests.conformance.link_probe import checked_values
 from starhil.hil_tests.conformance.ports import CanFrame, Port
@@ -131,11 +131,11 @@ class CanopenProbe(Probe):
     def identity(self) -> str:
         """Return names, versions and numbers of the node, as far as it has them."""
         texts = {what: self.try_read(index) for what, index in TEXTS.items() if index in self.od}
-        found = {what: text.decode("latin-1") for what, text in texts.items() if isinstance(text, bytes)}
+        parts = {what: text.decode("latin-1") for what, text in texts.items() if isinstance(text, bytes)}
         for subindex, what in enumerate(("vendor", "product", "revision", "serial number"), 1):
             if isinstance(number := self.try_read(0x1018, subindex), bytes):
-                found[what] = f"0x{int.from_bytes(number, 'little'):08X}"
-        return ", ".join(f"{what} {text}" for what, text in found.items())
+                parts[what] = f"0x{int.from_bytes(number, 'little'):08X}"
+        return ", ".join(f"{what} {text}" for what, text in parts.items())
 
     def silence(self, *, booting: bool) -> str | None:
         """Return `nothing` if the node does not answer a read of its device type, None if it does.
@@ -147,6 +147,7 @@ class CanopenProbe(Probe):
             self.drain()
             self.nmt(RESET_COMMUNICATION)
         mine = {base + self.node for base in (EMERGENCY, SDO_RESPONSE, HEARTBEAT)}
+        # a node that boots loses requests
         for _ in range(3):
             self.send_request(upload_request(0x1000, 0))
             if self.wait_for(mine, max(ANSWER_S, BOOT_S / 3) if booting else ANSWER_S) is not None:
@@ -207,7 +208,10 @@ class CanopenProbe(Probe):
     ) -> None:
         """Send a frame; text is hexadecimal."""
         payload = bytes.fromhex(data) if isinstance(data, str) else data
-        frame = CanFrame(can_id, payload, extended=extended, remote=remote)
+        self.send_frame(CanFrame(can_id, payload, extended=extended, remote=remote))
+
+    def send_frame(self, frame: CanFrame) -> None:
+        """Send a frame as it is."""
         self.log.append(f"{self.now():.4f} -> {frame!s}")
         self.port.send(frame)
 
@@ -232,13 +236,13 @@ class CanopenProbe(Probe):
         accept: Callable[[bytes], bool] = lambda _data: True,
     ) -> bytes | None:
         """Return the data of the next accepted frame with one of the CAN IDs, or None."""
-        wanted = {can_ids} if isinstance(can_ids, int) else can_ids
+        accepted_ids = {can_ids} if isinstance(can_ids, int) else can_ids
         end = self.now() + (ANSWER_S if timeout_s is None else timeout_s)
         while (left := end - self.now()) >= 0:
             frame = self.receive(left)
             if frame is None:
                 return None
-            if frame.id in wanted and not frame.extended and not frame.remote and accept(frame.data):
+            if frame.id in accepted_ids and not frame.extended and not frame.remote and accept(frame.data):
                 return frame.data
         return None
 
@@ -263,13 +267,13 @@ class CanopenProbe(Probe):
 
     def count(self, can_id: int, for_s: float) -> list[tuple[float, bytes]]:
         """Return time and data of the frames with a CAN ID within a time."""
-        end, found = self.now() + for_s, []
+        end, frames = self.now() + for_s, []
         while (left := end - self.now()) > 0:
             data = self.wait_for(can_id, left)
             if data is None:
                 break
-            found.append((self.now(), data))
-        return found
+            frames.append((self.now(), data))
+        return frames
 
     # SDO
 
@@ -280,6 +284,7 @@ class CanopenProbe(Probe):
 
     def send_request(self, data: bytes) -> None:
         """Send an SDO request, padded to 8 bytes."""
+        # initiates a download, an upload, a block upload or a block download: an abort has to name its object
         if data[0] >> 5 in {1, 2} or data[0] & 0xE3 == 0xA0 or data[0] & 0xE1 == 0xC0:
             self._multiplexer = data[1:4]
         self.send(SDO_REQUEST + self.node, data.ljust(SDO_SIZE, b"\0"))
@@ -440,12 +445,12 @@ class CanopenProbe(Probe):
 
         The entries are read repeatedly, until no new sample has come in between.
         """
-        seen = [b"", bytes(row.size)]
+        samples = [b"", bytes(row.size)]
         for _ in range(10):
-            seen.append(row_data(row, self.entries, self._part))
-            if seen[-1] == seen[-2]:
+            samples.append(row_data(row, self.entries, self._part))
+            if samples[-1] == samples[-2]:
                 break
-        return checked_values(row, seen[-1])
+        return checked_values(row, samples[-1])
 
     def _part(self, entry: Entry) -> bytes:
         data = self.value(entry)
@@ -464,16 +469,16 @@ class CanopenProbe(Probe):
 
     def variables(self) -> list[ODVariable]:
         """Return all variables of the EDS, without those that only describe data types."""
-        found: list[ODVariable] = []
+        variables: list[ODVariable] = []
         for index in sorted(self.od.indices):
             if index < 0x1000:
                 continue
             item = self.od.indices[index]
             if isinstance(item, ODVariable):
-                found.append(item)
+                variables.append(item)
             else:
-                found += [item.subindices[subindex] for subindex in sorted(item.subindices)]
-        return found
+                variables += [item.subindices[subindex] for subindex in sorted(item.subindices)]
+        return variables
 
     def lacks(self, entry: str) -> bool:
         """Return whether the EDS lacks an object or entry, `INDEX` or `INDEX:SUBINDEX` in hexadecimal."""
@@ -501,20 +506,19 @@ class CanopenProbe(Probe):
         return [index for index in sorted(self.od.indices) if first <= index < first + 0x200]
 
 
-def check_abort(seen: bytes | None, *codes: int, multiplexer: str = "") -> None:
+def check_abort(answer: bytes | None, *codes: int, multiplexer: str = "") -> None:
     """Fail unless an SDO answer is an abort with one of the codes; an empty multiplexer matches any."""
     expected = "abort " + " or ".join(f"0x{code:08X}" for code in codes)
-    if seen is None or len(seen) != 8 or seen[0] != ABORT or abort_code(seen) not in codes:
-        raise CaseFailed(expected, _seen(seen))
-    if multiplexer not in ("", seen[1:4].hex()):
-        raise CaseFailed(f"{expected} for object {multiplexer}", _seen(seen))
+    if answer is None or len(answer) != 8 or answer[0] != ABORT or abort_code(answer) not in codes:
+        raise CaseFailed(expected, _seen(answer))
+    if multiplexer not in ("", answer[1:4].hex()):
+        raise CaseFailed(f"{expected} for object {multiplexer}", _seen(answer))
 
 
-def check_answer(seen: bytes | None, answer: str) -> None:
+def check_answer(data: bytes | None, answer: str) -> None:
     """Fail unless an SDO answer has these bytes, of which `..` is any one, and a final `*` any others."""
-    pattern = re.escape(answer.replace(" ", "")).replace(r"\.\.", "..").replace(r"\*", ".*")
-    if seen is None or re.fullmatch(pattern, seen.hex()) is None:
-        raise CaseFailed(f"SDO answer {answer}", _seen(seen))
+    if data is None or not matches(pattern(answer), data.hex().upper()):
+        raise CaseFailed(f"SDO answer {answer}", _seen(data))
 
 
 def size_of(item: ODVariable) -> int | None:

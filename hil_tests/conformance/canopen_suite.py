@@ -21,22 +21,22 @@ DESIGN: Final = CaseArea[CanopenProbe]("design", "interface definition: canopen.
 @DESIGN.case("attitude", "TPDOs with the same sequence number are of one sample")
 def attitude(probe: CanopenProbe) -> None:
     marker = probe.find("object named sequence", lambda item: item.name == "sequence" and item.pdo_mappable)
-    chosen: list[int] = []
+    can_ids: list[int] = []
     probe.quiet()
     for index in probe.pdo_indices(0x1800):
         mapped = probe.number(index + 0x200, 0) and probe.number(index + 0x200, 1) >> 8
         if mapped == marker.index << 8 | marker.subindex:
             probe.set(index, 2, 1, 1)
-            can_id = 0x3E0 + len(chosen)
+            can_id = 0x3E0 + len(can_ids)
             probe.set(index, 1, PDO_OFF | NO_RTR | can_id)
             probe.set(index, 1, NO_RTR | can_id)
-            chosen.append(can_id)
-    check(len(chosen) >= 2, "two TPDOs that begin with the sequence number", len(chosen))
+            can_ids.append(can_id)
+    check(len(can_ids) >= 2, "two TPDOs that begin with the sequence number", len(can_ids))
     probe.nmt(START)
     for _ in range(5):
         probe.drain()
         probe.send(SYNC)
-        heads = {probe.expect(can_id, "TPDO")[:2] for can_id in chosen}
+        heads = {probe.expect(can_id, "TPDO")[:2] for can_id in can_ids}
         check_equal(len(heads), 1, "sequence numbers and flags after one SYNC:")
 
 

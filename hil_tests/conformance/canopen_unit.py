@@ -40,7 +40,7 @@ from starhil.hil_tests.judge.rows import Field, Row
 
 BOOT_S: Final = 15.0
 """Maximum time from a reset to the end of booting."""
-CHANGING: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
+CHANGING_QUANTITIES: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
 """Prefixes of the names of quantities that change with each exposure."""
 UNUSED_ID: Final = 0x3E0
 """CAN ID for a PDO that has none."""
@@ -71,11 +71,11 @@ def _argument(entry: Entry, name: str) -> Field | None:
 # --- telemetry ---
 
 
-def _rows(unit: Unit, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+def _rows(unit: Unit, entries: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     for row in unit.telemetry.values():
-        if not any(entry.row is row for entry in found):
+        if not any(entry.row is row for entry in entries):
             continue
-        read = {slot.offset for _, slot in slots(row, found)}
+        read = {slot.offset for _, slot in slots(row, entries)}
         fields = [item for item in row.named.values() if item.offset in read]
         attitude = AttitudeRow.of(row, unit.conventions, fields)
         title = f"the entries of {row.name} have the right sizes, and values within the limits"
@@ -157,7 +157,6 @@ def _restarts(command: Row, probe: CanopenProbe) -> None:
 
 
 def _fields(entry: Entry) -> list[Field]:
-    """Return the telemetry fields of an entry."""
     fields = () if entry.row is None else entry.row.named.values()
     return [field for field in fields if entry.slot is not None and field.offset == entry.slot.offset]
 
@@ -183,12 +182,12 @@ def _reported(entry: Entry, command: Row, probe: CanopenProbe) -> None:
     probe.put(entry, before or b"\0")
 
 
-def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+def _records(entries: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     """Yield the cases for records whose entries together set one telecommand."""
     for command in {
-        entry.command.name: entry.command for entry in found if entry.command and entry.part
+        entry.command.name: entry.command for entry in entries if entry.command and entry.part
     }.values():
-        members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
+        members = [entry for entry in entries if entry.command is command and entry.size <= EXPEDITED]
         title = f"each entry of {command.name} keeps its written value when other entries are written"
         yield _case("records", command.name, title, partial(_keeps_values, command, members), command)
 
@@ -238,8 +237,8 @@ def _refused(entry: Entry, data: bytes, probe: CanopenProbe) -> None:
 # --- PDOs ---
 
 
-def _pdos(layout: Any, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
-    by_name = {entry.name.lower(): entry for entry in found}
+def _pdos(layout: Any, entries: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+    by_name = {entry.name.lower(): entry for entry in entries}
     for first, models in ((0x1400, layout.rpdo), (0x1800, layout.tpdo)):
         kind = "tpdos" if first == 0x1800 else "rpdos"
         for number, model in enumerate(models):
@@ -258,12 +257,14 @@ def _pdos(layout: Any, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
                 first == 0x1800
                 and model.enabled
                 and not model.event_ms
-                and any(_reports(entry, *CHANGING) and not _fields(entry)[0].width for entry in mapped)
+                and any(
+                    _reports(entry, *CHANGING_QUANTITIES) and not _fields(entry)[0].width for entry in mapped
+                )
             ):
                 title = f"{label} is sent when frames are taken"
                 yield _case(kind, f"{number + 1}.frames", title, partial(_sent_with_frames, index, model))
             if first == 0x1400 and model.enabled:
-                yield from _clock(index, model, mapped, found)
+                yield from _clock(index, model, mapped, entries)
 
 
 def _default(index: int, model: Any, mapped: list[Entry], probe: CanopenProbe) -> None:

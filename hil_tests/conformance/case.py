@@ -52,6 +52,10 @@ class Probe(ABC):
     def sleep(self, seconds: float) -> None:
         """Wait."""
 
+    @abstractmethod
+    def drain(self) -> None:
+        """Discard everything received."""
+
     # --- rows ---
 
     @abstractmethod
@@ -117,7 +121,6 @@ class Case(Generic[ProbeType]):
     id: str
     """Dotted name, unique: link, area, check."""
     area: str
-    """Area of the protocol."""
     title: str
     """The checked behaviour, one line."""
     clause: str

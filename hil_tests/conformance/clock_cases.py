@@ -6,7 +6,7 @@
     a time   advances by t3 - t2 to t4 - t1, to the resolution of its field and `DRIFT`
     a count  advances by what was sent, a count of frames with time
 
-Clocks of unit and tester need not agree: only what passes is compared. Source: docs/quantities.md, which says what each quantity counts.
+The clocks of unit and tester need not agree: only elapsed times are compared. Source: docs/quantities.md, which says what each quantity counts.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ PAUSE_S: Final = 1.5
 """Time between two readings: more than the second of a time in whole seconds."""
 DRIFT: Final = 0.01
 """Largest difference between the rates of the two clocks."""
-ASKED: Final = 3
+REQUESTS_BETWEEN: Final = 3
 """Requests sent between two readings."""
 FRAME_RATE_HZ: Final = 100.0
 """Highest rate of measurements."""
 DAY_S: Final = 86_400.0
 SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-WHOLE: Final = {
+FRACTIONS_OF: Final = {
     "uptime": (),
     "uptime.seconds": ("uptime.milliseconds",),
     "clock.unix": (),
@@ -44,7 +44,11 @@ WHOLE: Final = {
     "frame.time_seconds": ("frame.time_nanoseconds",),
 }
 """Times that go on without end, and the fractions that may stand beside them in a row."""
-SENT: Final = {"counters.telemetry": (1, 0), "counters.telecommands": (0, 1), "counters.requests": (1, 1)}
+COUNT_INCREMENTS: Final = {
+    "counters.telemetry": (1, 0),
+    "counters.telecommands": (0, 1),
+    "counters.requests": (1, 1),
+}
 """Counts of requests: how much a telemetry request and a telecommand add."""
 FRAMES: Final = frozenset({"frame.counter", "counters.frames"})
 
@@ -94,7 +98,7 @@ def _span(item: Field) -> float:
 def times_of(row: Row) -> Iterator[Time]:
     """Yield the times in a row; the nth whole number has the nth of each fraction."""
     named = list(row.named.values())
-    for whole, fractions in WHOLE.items():
+    for whole, fractions in FRACTIONS_OF.items():
         for number, item in enumerate([field for field in named if field.quantity == whole]):
             parts = [[field for field in named if field.quantity == name] for name in fractions]
             yield Time((item, *(found[number] for found in parts if number < len(found))))
@@ -124,15 +128,15 @@ def clock_cases(unit: Unit) -> Iterator[Case[LinkProbe]]:
         if row.only_sent and not row.is_streamed:
             continue
         times = [item for item in times_of(row) if not item.of_frame]
-        counts = [item for item in counts_of(row, SENT) if unit.readable and not row.only_sent]
-        asked = [item for item in counts if SENT[item.quantity][0]]
-        if times or asked:
+        counts = [item for item in counts_of(row, COUNT_INCREMENTS) if unit.readable and not row.only_sent]
+        counted_requests = [item for item in counts if COUNT_INCREMENTS[item.quantity][0]]
+        if times or counted_requests:
             title = (
                 f"times and counts of requests in {row.name} advance as the tester's clock and requests do"
             )
-            run = partial(_clocks, row, times, asked)
+            run = partial(_clocks, row, times, counted_requests)
             yield case_in("clocks", row.name, title, run, row)
-        commanded = [item for item in counts if SENT[item.quantity][1]]
+        commanded = [item for item in counts if COUNT_INCREMENTS[item.quantity][1]]
         if commanded and command is not None:
             title = f"counts of telecommands in {row.name} advance as they are sent"
             run = partial(_commands, row, commanded, command)
@@ -181,11 +185,11 @@ def _counted(item: Field, passage: Passage) -> float | None:
 
 def _check_sent(row: Row, counts: list[Field], passage: Passage, telemetry: int, telecommands: int) -> None:
     for item in counts:
-        seen = _counted(item, passage)
-        per_read, per_command = SENT[item.quantity]
+        count = _counted(item, passage)
+        per_read, per_command = COUNT_INCREMENTS[item.quantity]
         wanted = (telemetry * per_read + telecommands * per_command) * 1.0
         at = f"{row.name}.{item.name} ({item.quantity}) {wanted:g} more"
-        check(seen in (None, wanted), at, f"{passage.before[item.name]!s} and {passage.after[item.name]!s}")
+        check(count in (None, wanted), at, f"{passage.before[item.name]!s} and {passage.after[item.name]!s}")
 
 
 def check_times(row: Row, times: list[Time], passage: Passage, epoch: str) -> None:
@@ -197,23 +201,23 @@ def check_times(row: Row, times: list[Time], passage: Passage, epoch: str) -> No
         check(low <= passed <= high, wanted, f"{passed:.9g} s")
 
 
-def _clocks(row: Row, times: list[Time], asked: list[Field], probe: LinkProbe) -> None:
+def _clocks(row: Row, times: list[Time], counts: list[Field], probe: LinkProbe) -> None:
     def wait() -> None:
-        for _ in range(ASKED if probe.unit.readable else 0):
+        for _ in range(REQUESTS_BETWEEN if probe.unit.readable else 0):
             probe.expect_alive()
         probe.sleep(PAUSE_S)
 
     passage = passage_of(probe, row, wait)
     check_times(row, times, passage, probe.unit.conventions.epoch)
-    _check_sent(row, asked, passage, ASKED + 1, 0)
+    _check_sent(row, counts, passage, REQUESTS_BETWEEN + 1, 0)
 
 
 def _commands(row: Row, counts: list[Field], command: Row, probe: LinkProbe) -> None:
     def send() -> None:
-        for _ in range(ASKED):
+        for _ in range(REQUESTS_BETWEEN):
             probe.send_command(command, command.encode())
 
-    _check_sent(row, counts, passage_of(probe, row, send), 1, ASKED)
+    _check_sent(row, counts, passage_of(probe, row, send), 1, REQUESTS_BETWEEN)
 
 
 def _measurements(row: Row, times: list[Time], counts: list[Field], probe: LinkProbe) -> None:
@@ -232,11 +236,11 @@ def _measurements(row: Row, times: list[Time], counts: list[Field], probe: LinkP
         wanted = f"{row.name}.{time} at most {high:.3f} s later, by the tester's clock"
         check(max(low, time.resolution_s / 4) <= passed <= high, wanted, f"{passed:.9g} s")
     for item in counts:
-        seen = _counted(item, passage)
-        if not seen:
+        count = _counted(item, passage)
+        if not count:
             still.append(item.name)
             continue
         most = passage.most_s * FRAME_RATE_HZ + 1.0
-        check(0.0 < seen <= most, f"{row.name}.{item.name} at most {most:.0f} more", f"{seen:g}")
+        check(0.0 < count <= most, f"{row.name}.{item.name} at most {most:.0f} more", f"{count:g}")
     if still:
         raise CaseSkipped(f"not judged, because nothing was measured meanwhile: {', '.join(still)}")

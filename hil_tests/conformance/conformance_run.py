@@ -258,7 +258,6 @@ def _probes(
 
 
 def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
-    """Start an emulator with the requested links."""
     folder = stack.enter_context(temporary_folder("starhil-"))
     channel = request.can or "off"
     if channel == "auto":

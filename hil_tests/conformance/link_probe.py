@@ -26,7 +26,7 @@ SEQUENCE: Final = "sequence"
 
 SETTING_ACTIONS: Final = frozenset({None, "nothing", "set_parameters", "subscribe", "select_unsolicited"})
 """Actions of the device model that repeating a telecommand with the same data does not carry out again."""
-UNASKED: Final = frozenset({"unsolicited_rate", "unsolicited_selection"})
+UNSOLICITED_PARAMETERS: Final = frozenset({"unsolicited_rate", "unsolicited_selection"})
 """Parameters that change what a unit sends unasked."""
 LONG_PAUSE_S: Final = 0.8
 """Pause after which the device has abandoned an incomplete message (after 0.5 s)."""
@@ -36,9 +36,9 @@ FRAME_S: Final = 10.0
 """Longest time from one measurement to the next."""
 RECOVERY_S: Final = 1.0
 """Pause after a failed case, in which time-outs of the device pass."""
-SHOWING: Final = 8
+LIVELY_SIZE: Final = 8
 """Bytes of telemetry in which a lost or shifted byte shows."""
-REPORTED: Final = {
+REPORT_QUANTITIES: Final = {
     "request.last": "last telecommand",
     "request.error": "its error",
     "request.index": "index of the refused field",
@@ -93,14 +93,14 @@ class ReadableSettings:
 def changes_link(unit: Unit, command: Row) -> bool:
     """Return whether a telecommand sets how the unit is reached, or what it sends unasked."""
     names = {item.parameter for item in command.named.values() if item.parameter is not None}
-    return any(name in UNASKED or unit.device_parameters[name].of_link for name in names)
+    return any(name in UNSOLICITED_PARAMETERS or unit.device_parameters[name].of_link for name in names)
 
 
 def lively_row(unit: Unit, can_refuse: Callable[[str], bool]) -> Row:
     """Return the smallest row whose errors show: of several bytes, in a class that can be refused, read without effect."""
 
     def unsuitable(row: Row) -> tuple[bool, bool, bool, int]:
-        return row.action is not None, not can_refuse(row.klass), row.size < SHOWING, row.size
+        return row.action is not None, not can_refuse(row.message_class), row.size < LIVELY_SIZE, row.size
 
     return min(unit.readable.values(), key=unsuitable)
 
@@ -142,9 +142,14 @@ class LinkProbe(Probe):
     def post_request(self, request: Request, *, answered: bool = True) -> None:
         """Send a request without waiting; `answered` unless no answer is expected."""
 
+    @property
+    def addresses(self) -> Mapping[str, str]:
+        """Names in braces for the addresses on the link, which a case written as text has in its traffic."""
+        return {}
+
     @abstractmethod
-    def exchange(self, sent: str, answers: Sequence[str]) -> None:
-        """Send raw traffic, and take the answers to it, which must be these; both in the format of `case_file`."""
+    def exchange(self, sent: Sequence[str], answers: Sequence[str]) -> None:
+        """Send raw traffic, and take the answers to it, which must be these; both in the format of `dialogue`."""
 
     @abstractmethod
     def _answer_within(self, seconds: float) -> Answer | None:
@@ -196,7 +201,7 @@ class LinkProbe(Probe):
         """Return the answers of a row on this link."""
         return row.answers
 
-    def can_refuse(self, klass: str) -> bool:  # noqa: ARG002 -- for links on which it depends
+    def can_refuse(self, message_class: str) -> bool:  # noqa: ARG002 -- for links on which it depends
         """Return whether answers of a class can express a refusal."""
         return True
 
@@ -225,14 +230,14 @@ class LinkProbe(Probe):
         """Return the telemetry of the unit that can be read: by a request, or by waiting for it."""
         return (row for row in self.unit.telemetry.values() if not row.only_sent or row.is_streamed)
 
-    def post(self, row: Row | int, data: bytes = b"", klass: str = "") -> None:
+    def post(self, row: Row | int, data: bytes = b"", message_class: str = "") -> None:
         """Send a request for a row, or for an ID that need not belong to one, without waiting."""
-        self.post_request(self.unit.request(row, data, klass))
+        self.post_request(self.unit.request(row, data, message_class))
 
-    def ask(self, row: Row | int, data: bytes = b"", klass: str = "") -> Answer:
+    def ask(self, row: Row | int, data: bytes = b"", message_class: str = "") -> Answer:
         """Send a request and return the answer; of an answer in several parts, the last.
 
-        Other rows that answer a request follow its reply, or stand for it.
+        Other rows that answer a request follow its reply, or replace it.
         """
         others = []
         if isinstance(row, Row):
@@ -240,13 +245,13 @@ class LinkProbe(Probe):
             others = [self.unit.telemetry[name] for name in named if name]
         if others and not self.names_rows:
             raise CaseSkipped(f"on this link an answer does not name its row, such as {others[0].name}")
-        self.post(row, data, klass)
+        self.post(row, data, message_class)
         answer = self.last_answer()
         if not isinstance(row, Row) or not others or answer.kind not in ("ack", "telemetry"):
             return answer
         if answer.row_id != row.id and "reply" not in self.answers(row):
             self._check_row(others.pop(0), answer)
-            answer = replace(answer, kind="ack", row_id=row.id, klass=row.klass)
+            answer = replace(answer, kind="ack", row_id=row.id, message_class=row.message_class)
         for other in others:
             self._check_row(other, self.next_answer())
         return answer
@@ -280,14 +285,19 @@ class LinkProbe(Probe):
         while self.now() < end:
             self._receive(end - self.now())
             for answer in self._unsolicited_answers():
-                if (answer.row_id, answer.klass) == (row.id, row.klass) and len(answer.data) == row.size:
+                if (answer.row_id, answer.message_class) == (row.id, row.message_class) and len(
+                    answer.data
+                ) == row.size:
                     return answer
         raise CaseFailed(f"{row.name} ({row.id}) of {row.size} bytes within {period_s:g} s", "nothing")
 
     def expect_telemetry(self, row: Row, timeout_s: float | None = None) -> Answer:
         """Take the next answer, which must be the telemetry of a row."""
         answer = self.next_answer(timeout_s)
-        named = answer.row_id is None or (answer.row_id, answer.klass) in ((row.id, row.klass), (row.id, ""))
+        named = answer.row_id is None or (answer.row_id, answer.message_class) in (
+            (row.id, row.message_class),
+            (row.id, ""),
+        )
         if answer.kind != "telemetry" or len(answer.data) != row.size or not named:
             raise CaseFailed(f"telemetry {row.name} ({row.id}) of {row.size} bytes", str(answer))
         return answer
@@ -315,21 +325,23 @@ class LinkProbe(Probe):
         accepted = answer.kind == "ack" and answer.row_id in (None, row.id)
         check(accepted, f"acknowledge of telecommand {row.name} ({row.id})", answer)
 
-    def expect_refusal(self, row: Row | int, data: bytes, error: str, klass: str = "") -> None:
+    def expect_refusal(self, row: Row | int, data: bytes, error: str, message_class: str = "") -> None:
         """Send a request that must be refused with a code.
 
         Where no answer can express the refusal it must not be answered, and a row that reports the last
         telecommand must report it.
         """
-        request = self.unit.request(row, data, klass)
+        request = self.unit.request(row, data, message_class)
         known = self.unit.row(request)
         what = f"{request} ({known.name})" if known is not None else str(request)
-        if not self.can_refuse(request.klass) or (known is not None and "reply" not in self.answers(known)):
+        if not self.can_refuse(request.message_class) or (
+            known is not None and "reply" not in self.answers(known)
+        ):
             self.post_request(request, answered=False)
             self.expect_silence(f"no answer can express the refusal of {what} on this link")
             self.check_reported(request.id, error)
             return
-        self.post(row, data, klass)
+        self.post(row, data, message_class)
         self.expect_nack(f"refusal of {what}", error)
 
     def expect_nack(self, what: str, error: str) -> None:
@@ -345,22 +357,22 @@ class LinkProbe(Probe):
 
     def check_reported(self, row_id: int, error: str, index: int | None = None) -> None:
         """Read the row that reports the last telecommand, if the unit has one: ID, error, and index of a field."""
-        wanted: dict[str, Value | None] = {
+        expectations: dict[str, Value | None] = {
             "request.last": row_id,
             "request.error": error,
             "request.index": index,
         }
         for row in self.unit.readable.values():
-            named = {item.value: name for name, item in row.named.items() if item.value in REPORTED}
+            named = {item.value: name for name, item in row.named.items() if item.value in REPORT_QUANTITIES}
             if "request.error" not in named:
                 continue
-            seen = self.telemetry(row.name)
+            values = self.telemetry(row.name)
             for quantity, name in named.items():
-                expected = wanted[str(quantity)]
-                if quantity == "request.error" and not isinstance(seen[name], str):
+                expected = expectations[str(quantity)]
+                if quantity == "request.error" and not isinstance(values[name], str):
                     expected = self.unit.code(error)
                 if expected is not None:
-                    check_equal(seen[name], expected, REPORTED[str(quantity)])
+                    check_equal(values[name], expected, REPORT_QUANTITIES[str(quantity)])
 
     def expect_silence(self, why: str, seconds: float | None = None) -> None:
         """Fail the case if anything but unsolicited telemetry arrives within a time."""
@@ -372,20 +384,20 @@ class LinkProbe(Probe):
         """Fail the case unless the next valid request is answered."""
         self.data_of(self.lively)
 
-    def wait_for(self, name: str, wanted: Mapping[str, Value], within_s: float) -> dict[str, Value]:
+    def wait_for(self, name: str, expected: Mapping[str, Value], within_s: float) -> dict[str, Value]:
         """Read a row until its fields have the wanted values; fail the case if this takes too long."""
         end = self.now() + within_s
         row = self.unit.telemetry[name]
         while True:
             answer = self.ask(row)
-            seen: object = answer
+            last: object = answer
             if answer.kind == "telemetry" and len(answer.data) == row.size:
                 values = row.decode(answer.data)
-                if all(values[key] == value for key, value in wanted.items()):
+                if all(values[key] == value for key, value in expected.items()):
                     return values
-                seen = {key: values[key] for key in wanted}
+                last = {key: values[key] for key in expected}
             if self.now() > end:
-                raise CaseFailed(f"{name} with {dict(wanted)} within {within_s:g} s", str(seen))
+                raise CaseFailed(f"{name} with {dict(expected)} within {within_s:g} s", str(last))
             self.sleep(0.02)
 
     # --- around a case ---
@@ -397,6 +409,7 @@ class LinkProbe(Probe):
     def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same for all cases)
         """End a case; nothing more may arrive."""
         if passed:
+            # shorter than the silence with which most cases end by themselves: this only catches stragglers
             self.expect_silence("the case is over", self.times.quiet_s / 4)
 
     def recover(self) -> None:
@@ -407,15 +420,15 @@ class LinkProbe(Probe):
 
     def identity(self) -> str:
         """Return what the unit reports of its identity; empty if no row does."""
-        found: dict[str, Value] = {}
+        parts: dict[str, Value] = {}
         for row in self.unit.readable.values():
             names = [name for name, item in row.named.items() if (item.value or "").startswith("identity.")]
-            found |= {
+            parts |= {
                 name: value
                 for name, value in (self.telemetry(row.name) if names else {}).items()
                 if name in names
             }
-        return ", ".join(f"{name} {value!s}" for name, value in found.items())
+        return ", ".join(f"{name} {value!s}" for name, value in parts.items())
 
     def silence(self, *, booting: bool) -> str | None:
         """Read three telemetry rows; return None if one is answered correctly, otherwise the invalid answer, and what to check.
@@ -427,11 +440,11 @@ class LinkProbe(Probe):
         if not rows:
             return None if self.receive_unsolicited(FRAME_S) else "nothing"
         while True:
-            seen = [answer for row in rows if (answer := self._bad_answer(row)) is not None]
-            if len(seen) < len(rows):
+            bad_answers = [answer for row in rows if (answer := self._bad_answer(row)) is not None]
+            if len(bad_answers) < len(rows):
                 return None
             if self.now() >= end:
-                worst = max(seen, key=lambda answer: (bool(answer.fault), answer.kind != "none"))
+                worst = max(bad_answers, key=lambda answer: (bool(answer.fault), answer.kind != "none"))
                 unclear = worst.kind != "none" and not worst.fault
                 return f"{worst}; check --dialect, --baud and the addresses" if unclear else str(worst)
 

@@ -32,20 +32,20 @@ from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Value
 from starhil.hil_tests.judge.rows import Field, Row
 
-FLOOD: Final = 200
+FLOOD_REQUESTS: Final = 200
 SUBSCRIBED_S: Final = 3.0
-STREAMED: Final = 6
+LEAST_MESSAGES: Final = 6
 """Number of messages from which a rate is computed, at least."""
 RATE_TOLERANCE: Final = 0.2
-CAUSED: Final = frozenset({"frame", "mode", "validity"})
+MODE_EVENTS: Final = frozenset({"frame", "mode", "validity"})
 """Events that a telecommand of the mode causes."""
 SETTLING_S: Final = 1.0
 """Time after which a unit that identifies stars has an attitude."""
-RESTING: Final = 5
+PAIR_ATTEMPTS: Final = 5
 """Number of attempts to read two rows between two measurements."""
 F32_ROUNDING: Final = 1e-6
 CLOCK_S: Final = 1_700_000_000
-TIGHT: Final = frozenset({"delay_time", "orbit_eccentricity"})
+CONSTRAINED_PARAMETERS: Final = frozenset({"delay_time", "orbit_eccentricity"})
 """Parameters that may only have the present value, because all others contradict the exposure, the update rate or the orbit."""
 PUBLISHED_IDS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
 
@@ -62,7 +62,7 @@ def row_cases(
     numbers: bool = True,
     marks: bytes = b"",
     highest_id: int = 255,
-    sizes: Callable[[str], range] = lambda _klass: ANY_SIZE,
+    sizes: Callable[[str], range] = lambda _message_class: ANY_SIZE,
 ) -> Iterator[Case[LinkProbe]]:
     """Yield the cases for the rows of a unit.
 
@@ -94,7 +94,7 @@ def row_cases(
 
 
 def sent_cases(unit: Unit) -> Iterator[Case[LinkProbe]]:
-    """Yield the cases for a unit none of whose telemetry a request reads: those of the rows that it sends by itself."""
+    """Yield the cases for a unit whose telemetry cannot be requested: those of the rows that it sends unprompted."""
     for row in unit.telemetry.values():
         if row.is_streamed:
             yield from _telemetry(unit, row)
@@ -120,18 +120,22 @@ def _identifiers(unit: Unit, highest: int, sizes: Callable[[str], range]) -> Ite
     if not groups and unit.first_telemetry_id is not None:
         first = unit.first_telemetry_id
         groups = {"telemetry": ("", range(first, highest + 1)), "telecommands": ("", range(first))}
-    for name, (klass, numbers) in (groups or {"unknown": ("", range(highest + 1))}).items():
-        known = {row.id for row in unit.rows if not row.only_sent and (row.klass == klass or not klass)}
-        unknown = [number for number in numbers if number not in known]
-        if klass:  # every class has all numbers: those beside its rows, and both ends
-            near = {row_id + step for row_id in known for step in (-1, 1)} | {0, highest}
+    for name, (message_class, numbers) in (groups or {"unknown": ("", range(highest + 1))}).items():
+        row_ids = {
+            row.id
+            for row in unit.rows
+            if not row.only_sent and (row.message_class == message_class or not message_class)
+        }
+        unknown = [number for number in numbers if number not in row_ids]
+        if message_class:  # every class has all numbers: those beside its rows, and both ends
+            near = {row_id + step for row_id in row_ids for step in (-1, 1)} | {0, highest}
             unknown = sorted(near & set(unknown))
 
-        def run(probe: LinkProbe, klass: str = klass, unknown: list[int] = unknown) -> None:
+        def run(probe: LinkProbe, message_class: str = message_class, unknown: list[int] = unknown) -> None:
             for row_id in unknown:
-                probe.expect_refusal(row_id, bytes(sizes(klass)[0]), INVALID_ID, klass)
+                probe.expect_refusal(row_id, bytes(sizes(message_class)[0]), INVALID_ID, message_class)
 
-        title = f"unknown {'IDs of class ' + klass if klass else 'IDs' if name == 'unknown' else name} are refused"
+        title = f"unknown {'IDs of class ' + message_class if message_class else 'IDs' if name == 'unknown' else name} are refused"
         yield case_in("identifiers", name, title, run, PUBLISHED_IDS, intrusive=name != "telemetry")
 
 
@@ -152,7 +156,7 @@ def _lengths(unit: Unit, sizes: Callable[[str], range]) -> Iterator[Case[LinkPro
             "empty": b"" if row.min_size > 1 else None,
         }
         for why, data in tried.items():
-            if data is not None and len(data) in sizes(row.klass):
+            if data is not None and len(data) in sizes(row.message_class):
                 title = f"{row.name} with {len(data)} bytes ({why}) is refused for its length"
                 run = partial(_refused, row, data, INVALID_LENGTH, None)
                 yield case_in("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
@@ -233,8 +237,8 @@ def _layout(row: Row, name: str) -> tuple[object, ...]:
 
 def _compare(probe: LinkProbe, quantity: str, one: tuple[Row, str], other: tuple[Row, str]) -> None:
     """Compare two fields between two readings of the first that agree; skip a quantity that never rests."""
-    for _ in range(RESTING):
-        before, seen, after = (probe.values(row)[name] for row, name in (one, other, one))
+    for _ in range(PAIR_ATTEMPTS):
+        before, between, after = (probe.values(row)[name] for row, name in (one, other, one))
         if before == after:
             break
     else:
@@ -242,15 +246,15 @@ def _compare(probe: LinkProbe, quantity: str, one: tuple[Row, str], other: tuple
     first, second = (row.named[name] for row, name in (one, other))
     whole = "float" not in (first.kind, second.kind)
     alike = whole and (first.scale, first.bias) == (second.scale, second.bias)
-    numbers = (first, float(after)), (second, float(seen))
+    numbers = (first, float(after)), (second, float(between))
     margin = 0.0 if alike else sum(_resolution(item, number) for item, number in numbers)
     what = f"{quantity} in {other[0].name}.{other[1]} and {one[0].name}.{one[1]} alike, to {margin:.2g}"
     # a number beyond the limits of one field is sent as the nearest limit, and known only from the other
-    for (item, number), (against, found) in (numbers, numbers[::-1]):
+    for (item, number), (against, reading) in (numbers, numbers[::-1]):
         low, high = item.limits
         if low < number < high:
             nearest = min(max(number, against.limits[0]), against.limits[1])
-            check(abs(found - nearest) <= margin, what, f"{float(seen):.9g} and {float(after):.9g}")
+            check(abs(reading - nearest) <= margin, what, f"{float(between):.9g} and {float(after):.9g}")
 
 
 def _resolution(item: Field, number: float) -> float:
@@ -290,12 +294,12 @@ def _accepted(row: Row, probe: LinkProbe) -> None:
     """Send plain values, and both limits of each number if the row has no effect."""
     probe.send_command(row, row.encode())
     for name, item in row.named.items() if row.action == "nothing" else ():
-        for limit, given in zip(
+        for limit, bound in zip(
             item.limits if item.kind in ("integer", "float") else (),
             (item.minimum, item.maximum),
             strict=False,
         ):
-            if given is not None:
+            if bound is not None:
                 probe.send_command(row, row.encode({name: limit}))
 
 
@@ -317,7 +321,7 @@ def _set_and_read(command: Row, row: Row, places: Mapping[str, str], marks: byte
     tried = {name: list(_tried(command.named[name], before[name], marks, rng)) for name in places}
     if command.action == "set_parameters":
         attempts = [
-            (f"{command.name}.{name}", [before | {name: value} for value in values], 1 if command.named[name].parameter in TIGHT else 2)
+            (f"{command.name}.{name}", [before | {name: value} for value in values], 1 if command.named[name].parameter in CONSTRAINED_PARAMETERS else 2)
             for name, values in tried.items()
         ]  # fmt: skip
     else:
@@ -366,7 +370,7 @@ def _unsolicited(unit: Unit) -> Iterator[Case[LinkProbe]]:
         if isinstance(row.unsolicited, float):
             title = f"{row.name} is sent {row.unsolicited:g} times a second without a request"
             yield case_in("unsolicited", row.name, title, partial(_streamed, row, row.unsolicited), row)
-        elif row.unsolicited is not None and not CAUSED.isdisjoint(row.unsolicited):
+        elif row.unsolicited is not None and not MODE_EVENTS.isdisjoint(row.unsolicited):
             title = f"{row.name} is sent without a request after {' or '.join(row.unsolicited)}"
             yield case_in("unsolicited", row.name, title, partial(_reported, row), row, intrusive=True)
         elif row.unsolicited is not None and "start" in row.unsolicited and reset is not None:
@@ -377,16 +381,18 @@ def _unsolicited(unit: Unit) -> Iterator[Case[LinkProbe]]:
 
 def _of_row(row: Row, answers: list[Answer]) -> list[Answer]:
     """Return the messages of a row, whose values must be within their limits."""
-    found = [answer for answer in answers if (answer.row_id, answer.klass) == (row.id, row.klass)]
-    for answer in found:
+    messages = [
+        answer for answer in answers if (answer.row_id, answer.message_class) == (row.id, row.message_class)
+    ]
+    for answer in messages:
         check_equal(len(answer.data), row.size, f"bytes of {row.name}")
         checked_values(row, answer.data)
-    return found
+    return messages
 
 
 def _streamed(row: Row, rate_hz: float, probe: LinkProbe) -> None:
     _check_carried(probe)
-    seconds = max(SUBSCRIBED_S, STREAMED / rate_hz)
+    seconds = max(SUBSCRIBED_S, LEAST_MESSAGES / rate_hz)
     answers = probe.receive_unsolicited(seconds)
     probe.check_numbers(answers)
     wanted, seen = rate_hz * seconds, len(_of_row(row, answers))
@@ -405,14 +411,14 @@ def _reported(row: Row, probe: LinkProbe) -> None:
         probe.sleep(SETTLING_S)
         answers = probe.receive_unsolicited(SUBSCRIBED_S, search)
     probe.check_numbers(answers)
-    found = _of_row(row, answers)
-    check(bool(found), f"{row.name} within {SUBSCRIBED_S:g} s of a telecommand for {SEARCHING}", "none")
+    messages = _of_row(row, answers)
+    check(bool(messages), f"{row.name} within {SUBSCRIBED_S:g} s of a telecommand for {SEARCHING}", "none")
     modes = [name for name, item in row.named.items() if item.value == "mode"]
     if row.unsolicited == ["mode"] and modes and SEARCHING not in row.named[modes[0]].shared:
-        seen = [row.decode(answer.data)[modes[0]] for answer in found]
-        check_equal(seen[0], SEARCHING, "mode in the first message")
-        changes = all(one != other for one, other in pairwise(seen))
-        check(changes, "another mode in each message", seen)
+        modes_reported = [row.decode(answer.data)[modes[0]] for answer in messages]
+        check_equal(modes_reported[0], SEARCHING, "mode in the first message")
+        changes = all(one != other for one, other in pairwise(modes_reported))
+        check(changes, "another mode in each message", modes_reported)
 
 
 def _reported_at_start(row: Row, reset: Row, probe: LinkProbe) -> None:
@@ -432,9 +438,11 @@ def _check_carried(probe: LinkProbe) -> None:
 def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
     for row in unit.telecommands.values():
         fields = [name for name, item in row.named.items() if (item.argument or "").startswith("telemetry[")]
-        klass = str(row.arguments.get("class", ""))
+        message_class = str(row.arguments.get("class", ""))
         offered = [
-            item for item in unit.telemetry.values() if klass in ("", item.klass) and item.unsolicited is None
+            item
+            for item in unit.telemetry.values()
+            if message_class in ("", item.message_class) and item.unsolicited is None
         ][:2]
         if row.action == "subscribe" and fields and offered:
             title = f"{row.name} starts and stops unsolicited telemetry"
@@ -459,28 +467,38 @@ def _subscribe(command: Row, fields: list[str], offered: list[Row], probe: LinkP
 
     def of_list(seconds: float) -> list[Answer]:
         """Return the messages that the list has caused, not those that the unit always sends."""
-        seen = probe.receive_unsolicited(seconds)
-        probe.check_numbers(seen)
-        always = {(row.id, row.klass) for row in probe.unit.telemetry.values() if row.unsolicited is not None}
-        return [answer for answer in seen if (answer.row_id, answer.klass) not in always]
+        answers = probe.receive_unsolicited(seconds)
+        probe.check_numbers(answers)
+        always = {
+            (row.id, row.message_class)
+            for row in probe.unit.telemetry.values()
+            if row.unsolicited is not None
+        }
+        return [answer for answer in answers if (answer.row_id, answer.message_class) not in always]
 
     chosen = none | {name: row.id for name, row in zip(fields, offered, strict=False)}
     probe.send_command(command, command.encode(chosen))
-    seen = of_list(SUBSCRIBED_S)
+    messages = of_list(SUBSCRIBED_S)
     probe.send_command(command, command.encode(none))
     probe.sleep(0.5)
-    wanted = {(row.id, row.size) for row in offered[: len(fields)]}
-    check(len(seen) >= len(wanted), "a message of each row within 3 s", f"{len(seen)} messages")
-    check_equal({(answer.row_id, len(answer.data)) for answer in seen}, wanted, "rows and sizes")
-    check_equal({answer.klass for answer in seen} - {""}, {row.klass for row in offered} - {""}, "classes")
-    for answer in seen:
+    rows_and_sizes = {(row.id, row.size) for row in offered[: len(fields)]}
+    check(
+        len(messages) >= len(rows_and_sizes), "a message of each row within 3 s", f"{len(messages)} messages"
+    )
+    check_equal({(answer.row_id, len(answer.data)) for answer in messages}, rows_and_sizes, "rows and sizes")
+    check_equal(
+        {answer.message_class for answer in messages} - {""},
+        {row.message_class for row in offered} - {""},
+        "classes",
+    )
+    for answer in messages:
         checked_values(next(row for row in offered if row.id == answer.row_id), answer.data)
     check_equal(len(of_list(2.0)), 0, "messages after the end of the subscription")
 
 
 def _flood(probe: LinkProbe) -> None:
     rows = sorted(probe.unit.readable.values(), key=lambda row: row.size)[:2]
-    for number in range(FLOOD):
+    for number in range(FLOOD_REQUESTS):
         probe.post(rows[number % len(rows)])
-    for number in range(FLOOD):
+    for number in range(FLOOD_REQUESTS):
         probe.expect_telemetry(rows[number % len(rows)], 2.0)

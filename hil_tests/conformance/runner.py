@@ -71,14 +71,14 @@ def select_cases(
 
     Raises BenchError: a pattern matches no case.
     """
-    chosen = list(cases)
+    selection = list(cases)
     if patterns:
         for pattern in patterns:
-            if not any(_matches(item.id, pattern) for item in chosen):
-                areas = ", ".join(sorted({item.area for item in chosen}))
+            if not any(_matches(item.id, pattern) for item in selection):
+                areas = ", ".join(sorted({item.area for item in selection}))
                 raise BenchError(f"no conformance case matches '{pattern}'; areas: {areas}")
-        chosen = [item for item in chosen if any(_matches(item.id, pattern) for pattern in patterns)]
-    return [item for item in chosen if not (safe_only and item.intrusive)]
+        selection = [item for item in selection if any(_matches(item.id, pattern) for pattern in patterns)]
+    return [item for item in selection if not (safe_only and item.intrusive)]
 
 
 def _matches(case_id: str, pattern: str) -> bool:

@@ -1,7 +1,7 @@
 """Conformance on the serial line: framing, check, header, echoes, pace and recovery, for the link of any unit.
 
-The cases of a CubeSpace line at its limits are bytes in a file; those of a composed line change one part of a message
-that the judge has written.
+Edge cases of a CubeSpace line are bytes in a file; those of a composed line alter one part of a message that the judge has
+encoded.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def serial_cases(unit: Unit) -> Iterator[Case[Any]]:
         yield from sent_cases(unit)
         return
     lively = lively_row(unit, line.envelope.can_refuse)
-    framing, envelope = line.request_format(lively.klass)
+    framing, envelope = line.request_format(lively.message_class)
     yield from _framing(line, framing, in_text=bool(lively.request))
     highest = 255
     if line.dialect is not None:
@@ -138,13 +138,13 @@ def _framing(line: SerialLine, framing: Framing, *, in_text: bool) -> Iterator[C
     def overlong(probe: SerialProbe) -> None:
         size = probe.unit.serial.max_size or max(DEFAULT_MAX_SIZE, *(row.size for row in probe.unit.rows))
         request = probe.unit.request(probe.lively)
-        envelope = probe.line.request_format(request.klass)[1]
+        envelope = probe.line.request_format(request.message_class)[1]
         if in_text:
             probe.send(framing.encode(_body(probe) + plain[:1] * (size + 64)))
-        elif size + 64 in envelope.data_sizes(request.klass):
+        elif size + 64 in envelope.data_sizes(request.message_class):
             probe.send(probe.line.encode(replace(request, data=plain[:1] * (size + 64))))
         else:  # the longest message that its length field can state is not too long, but longer than the row
-            longest = envelope.data_sizes(request.klass)[-1]
+            longest = envelope.data_sizes(request.message_class)[-1]
             probe.expect_refusal(probe.lively, plain[:1] * longest, INVALID_LENGTH)
         probe.expect_silence("the message was too long")
         probe.sleep_past_timeout()
@@ -156,7 +156,7 @@ def _framing(line: SerialLine, framing: Framing, *, in_text: bool) -> Iterator[C
         answer = probe.expect_telemetry(probe.lively)
         probe.sleep(probe.times.quiet_s)
         echo = sent if "echo" in probe.lively.answers else b""
-        whole = echo + probe.line.telemetry_frame(answer.body, probe.lively.klass)
+        whole = echo + probe.line.telemetry_frame(answer.body, probe.lively.message_class)
         end = (
             marks[:1] if probe.unit.serial.framing.kind == "slip" else b""
         )  # which may be omitted before a frame
@@ -182,13 +182,13 @@ def serial_names(unit: Unit) -> dict[str, str]:
     """
     small = sorted(unit.readable.values(), key=lambda row: row.size)[:2]
     lively = lively_row(unit, SerialLine(unit).envelope.can_refuse)
-    found: dict[str, str] = {}
+    names: dict[str, str] = {}
     for name, row in (("row", small[0]), ("other", small[-1]), ("lively", lively)):
-        found |= {name: f"{row.id:02X}", f"{name}_id": str(row.id)}
-    found["read"] = f"1F 7F {found['row']} 1F FF"
+        names |= {name: f"{row.id:02X}", f"{name}_id": str(row.id)}
+    names["read"] = f"1F 7F {names['row']} 1F FF"
     if all(row.id != ESCAPE for row in unit.rows):
-        found["no_row_31"] = str(ESCAPE)
-    return found
+        names["no_row_31"] = str(ESCAPE)
+    return names
 
 
 # --- texts ---
@@ -214,7 +214,7 @@ def _texts(rows: list[Row]) -> Iterator[Case[SerialProbe]]:
 
     def refused(row: Row) -> Run:
         def run(probe: SerialProbe) -> None:
-            framing, envelope = probe.line.request_format(row.klass)
+            framing, envelope = probe.line.request_format(row.message_class)
             for text in others(row.request):
                 if isinstance(envelope, Headed):
                     probe.send(framing.encode(envelope.closed(b"", text.encode())))
@@ -233,7 +233,7 @@ def _texts(rows: list[Row]) -> Iterator[Case[SerialProbe]]:
 
 
 def _body(probe: SerialProbe) -> bytes:
-    return probe.line.request_format(probe.lively.klass)[1].body(probe.unit.request(probe.lively))
+    return probe.line.request_format(probe.lively.message_class)[1].body(probe.unit.request(probe.lively))
 
 
 def _check(envelope: Headed) -> Iterator[Case[SerialProbe]]:
@@ -244,7 +244,7 @@ def _check(envelope: Headed) -> Iterator[Case[SerialProbe]]:
     def silent(change: Callable[[bytes], Iterator[bytes]]) -> Run:
         def run(probe: SerialProbe) -> None:
             for body in change(_body(probe)):
-                probe.send(probe.line.request_format(probe.lively.klass)[0].encode(body))
+                probe.send(probe.line.request_format(probe.lively.message_class)[0].encode(body))
             probe.expect_silence("the check is wrong")
             probe.sleep_past_timeout()  # a length that was changed may announce more bytes
             probe.drain()
@@ -291,7 +291,7 @@ def _header(unit: Unit, envelope: Headed) -> Iterator[Case[SerialProbe]]:
             values = [own ^ 1, own ^ top, 0 if own else 1]
             yield _silent_header(envelope, "address", item, values, "another address")
         elif item.role == "class":
-            codes = {klass.code for klass in unit.classes}
+            codes = {message_class.code for message_class in unit.classes}
             values = [code for code in range(256) if code not in codes][:8]
             yield _silent_header(envelope, "class", item, values, "a class that the unit does not have")
         elif item.role is None and item.const is not None:
@@ -308,13 +308,13 @@ def _numbers(probe: SerialProbe) -> None:
 
 def _silent_header(envelope: Headed, name: str, item: Any, values: list[int], what: str) -> Case[SerialProbe]:
     def run(probe: SerialProbe) -> None:
-        klass = probe.lively.klass
-        header = _body(probe)[: envelope.requests.size(klass)]
-        offset, size = envelope.requests.place(item, klass)
+        message_class = probe.lively.message_class
+        header = _body(probe)[: envelope.requests.size(message_class)]
+        offset, size = envelope.requests.place(item, message_class)
         for value in values:
             piece = (value % (1 << 8 * size)).to_bytes(size, item.order or probe.unit.conventions.byte_order)
             changed = header[:offset] + piece + header[offset + size :]
-            probe.send(probe.line.request_format(klass)[0].encode(envelope.closed(changed, b"")))
+            probe.send(probe.line.request_format(message_class)[0].encode(envelope.closed(changed, b"")))
         probe.expect_silence(what)
         probe.drain()
         probe.expect_alive()
@@ -323,7 +323,7 @@ def _silent_header(envelope: Headed, name: str, item: Any, values: list[int], wh
 
 
 def _clock(unit: Unit, replies: Header) -> Iterator[Case[SerialProbe]]:
-    row = next((row for row in unit.readable.values() if "time" in replies.roles(row.klass)), None)
+    row = next((row for row in unit.readable.values() if "time" in replies.roles(row.message_class)), None)
     for command in unit.telecommands.values():
         names = {item.argument: name for name, item in command.named.items()}
         if command.action == "set_clock" and "microseconds" in names and row is not None:
@@ -383,7 +383,7 @@ def pace(probe: SerialProbe) -> None:
 def noise(probe: SerialProbe) -> None:
     rng = random.Random(7)  # noqa: S311 -- noise, not a secret
     # without its start byte, bytes are no CubeSpace message; in other framings any mark may end or begin one
-    marks = probe.line.request_format(probe.lively.klass)[0].marks
+    marks = probe.line.request_format(probe.lively.message_class)[0].marks
     left_out = marks[1:2] if probe.dialect is not None else marks
     for _ in range(20):
         probe.send(bytes(byte for byte in rng.randbytes(200) if byte not in left_out))

@@ -80,7 +80,9 @@ class SerialProbe(LinkProbe):
                 self.numbered.append(answer)
             if answer.kind == "unsolicited":
                 self.unsolicited.append(answer)
-                self.raw = self.raw.replace(self.line.telemetry_frame(answer.body, answer.klass), b"", 1)
+                self.raw = self.raw.replace(
+                    self.line.telemetry_frame(answer.body, answer.message_class), b"", 1
+                )
             else:
                 self._answers.append(answer)
         return True
@@ -115,26 +117,26 @@ class SerialProbe(LinkProbe):
     def streaming(self, rows: Iterable[Row]) -> Iterator[None]:
         """Take messages of these rows that no request awaits for unsolicited telemetry."""
         before = self.line.streamed
-        self.line.streamed = before.union((row.klass, row.id) for row in rows)
+        self.line.streamed = before.union((row.message_class, row.id) for row in rows)
         try:
             yield
         finally:
             self.line.streamed = before
 
-    def can_refuse(self, klass: str) -> bool:
+    def can_refuse(self, message_class: str) -> bool:
         """Return whether answers of a class can express a refusal."""
-        return self.line.envelope.can_refuse(klass)
+        return self.line.envelope.can_refuse(message_class)
 
     def distinguishes_refusal(self, row: Row) -> bool:
         """Return whether a refusal differs from the data, which in dialects a and b may be one byte as well."""
         return self.dialect not in ("a", "b") or row.size != 1
 
-    def exchange(self, sent: str, answers: Sequence[str]) -> None:
+    def exchange(self, sent: Sequence[str], answers: Sequence[str]) -> None:
         """Send bytes, and take the telemetry or the refusal of each row."""
         requests = [self.unit.request(int(answer.partition("!")[0])) for answer in answers]
         for request in requests:
             self.line.expect(request)
-        self.send(bytes.fromhex(sent))
+        self.send(bytes.fromhex("".join(sent)))
         for request, answer in zip(requests, answers, strict=True):
             row, error = self.unit.row(request), answer.partition("!")[2]
             if error or row is None:

@@ -1,9 +1,9 @@
 """All cases of a link: those that the definition of a unit yields, and the unit's own.
 
-A unit's own cases stand beside its definition, in files `*_cases.toml` (`case_file`) and `*_cases.py`. Each of the latter
-defines areas (`CaseArea`), whose cases get the probe of the link, or a function `generated`, which yields cases on serial
-and CAN for the definition that it gets; `settings`, if a file defines it, makes the object that records and restores the
-settings of the unit around a run on them. A case whose ID the definition yields too replaces that case.
+A unit's own cases are beside its definition, in files `*_cases.toml` (`case_file`) and `*_cases.py`. A Python file defines
+areas (`CaseArea`), whose cases get the probe of the link, or a function `generated`, which yields cases on serial and CAN
+for a given definition. If a file defines `settings`, that creates the object which records the settings of the unit before
+a run on these links, and restores them afterwards. An own case replaces the derived one with the same ID.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What no derived case judges: values in telemetry of which only the limits are known. They are listed as skipped."""
+"""Telemetry values that no derived case can judge, because only their limits are known; they are listed as skipped."""
 
 from __future__ import annotations
 
@@ -8,14 +8,20 @@ from typing import Any, Final
 
 from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, changes_mode
 from starhil.hil_tests.conformance.case import Case, CaseSkipped, Probe, case_in
-from starhil.hil_tests.conformance.clock_cases import FRAMES, SENT, counts_of, plain_command, times_of
-from starhil.hil_tests.conformance.link_probe import REPORTED
+from starhil.hil_tests.conformance.clock_cases import (
+    COUNT_INCREMENTS,
+    FRAMES,
+    counts_of,
+    plain_command,
+    times_of,
+)
+from starhil.hil_tests.conformance.link_probe import REPORT_QUANTITIES
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.rows import Field, Row
 
 CLAUSE: Final = "[[telemetry]]: `value` of a field"
 PLUGIN: Final = "plugin"
-LISTED: Final = 20
+LISTED_FIELDS: Final = 20
 """Number of fields that a reason names."""
 
 
@@ -33,11 +39,11 @@ def unjudged_cases(unit: Unit, fields: Iterable[tuple[Row, Field]]) -> Iterator[
 
 def unjudged_fields(unit: Unit, compared: Iterable[tuple[Row, str]]) -> Iterator[tuple[Row, Field]]:
     """Yield the fields that no case of a serial line or CAN judges; `compared` are judged by cases of several rows."""
-    known = {(row.name, name) for row, name in compared}
+    fields = {(row.name, name) for row, name in compared}
     for row in unit.telemetry.values():
         judged = {item.name for item in _judged(unit, row)}
         for name, item in row.named.items():
-            if name not in judged and (row.name, name) not in known:
+            if name not in judged and (row.name, name) not in fields:
                 yield row, item
 
 
@@ -48,8 +54,8 @@ def _kind(unit: Unit, item: Field) -> str:
 
 
 def _listed(kind: str, fields: list[str], _probe: Probe) -> None:
-    more = len(fields) - LISTED
-    names = ", ".join(fields[:LISTED]) + (f" and {more} more" if more > 0 else "")
+    more = len(fields) - LISTED_FIELDS
+    names = ", ".join(fields[:LISTED_FIELDS]) + (f" and {more} more" if more > 0 else "")
     remedy = "a case in a file *_cases.py beside the definition can" + (
         "; an attitude is judged in quantities attitude.…" if kind == PLUGIN else ""
     )
@@ -61,12 +67,16 @@ def _judged(unit: Unit, row: Row) -> Iterator[Field]:
     if row.only_sent and not row.is_streamed:
         return
     yield from stated(unit, row)
-    yield from (item for item in row.named.values() if item.quantity in REPORTED)
+    yield from (item for item in row.named.values() if item.quantity in REPORT_QUANTITIES)
     for time in times_of(row):
         yield from time.fields
     if not row.only_sent:
         commanded = plain_command(unit) is not None
-        yield from (item for item in counts_of(row, SENT) if SENT[item.quantity][0] or commanded)
+        yield from (
+            item
+            for item in counts_of(row, COUNT_INCREMENTS)
+            if COUNT_INCREMENTS[item.quantity][0] or commanded
+        )
     yield from counts_of(row, FRAMES)
 
 

@@ -9,8 +9,8 @@ A step is a JSON object with `do`:
 ``request``        `link`, `row` ("class id"), `data`: send a request and judge the answers
 ``burst``          `link`, `rows`: send telemetry requests without waiting; the answers come in order
 ``flood``          `link`, `row`, `data`, `count`: send the same request many times, so that counters of 16 bits wrap
-``cut``            `link`, `row`, `share`: send the first part of a request, as a client that goes away; another comes
-``nmt``            `link`, `command`: an NMT command, by which a CANopen node begins or ends to send PDOs
+``cut``            `link`, `row`, `share`: send the first part of a request, as by a client that disconnects; another one connects
+``nmt``            `link`, `command`: an NMT command, which starts or stops the PDOs of a CANopen node
 ``junk``           `link`, `data` or `frames`: send input that is not a request for this unit; nothing may answer
 ``truth``          `truth`: a table as `[truth]` in a profile
 ``fault``          `fault`: a request of faults as on the control channel; ``clear`` ends all faults
@@ -22,7 +22,7 @@ A step is a JSON object with `do`:
 =================  ==================================================================================================
 
 Two kinds of lives: in most, everything happens and power is switched often. In a long one, the unit is left alone for
-days, without resets and with the lowest update rates, so that its counters and clocks pass their wraps while observed.
+days, without resets and with the lowest update rates, so that its counters and clocks wrap around under observation.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ LONG_WAIT_S: Final = (20_000.0, 300_000.0)
 MOST_EVENTS_LONG: Final = {False: 40_000, True: 4000}
 """Waits of a long life end early after about this many events, by whether the unit sends heartbeats every second."""
 LONG_UPDATE_RATE_HZ: Final = (0.01, 0.02)
-FLOOD: Final = (20_000, 40_000)
+FLOOD_REQUESTS: Final = (20_000, 40_000)
 """Limits of the number of requests in a flood."""
 USUAL_SHARE: Final = 0.9
-"""Share of values that are set to their default, so that the unit mostly works."""
-COUNTING: Final = ("counters.", "uptime", "clock.", "boot.count")
-"""Beginnings of the quantities that count."""
+"""Share of values that are set to their default, so that the unit stays usable most of the time."""
+COUNTING_QUANTITIES: Final = ("counters.", "uptime", "clock.", "boot.count")
+"""Prefixes of the names of quantities that count."""
 ACTION_WEIGHTS: Final = {
     "set_parameter": 6.0,
     **dict.fromkeys(("save_parameters", "restore_parameters", "default_parameters"), 2.0),
@@ -66,6 +66,8 @@ ADDRESSES: Final = frozenset({"can_address", "serial_dialect"})
 """Parameters that the OBC must follow to reach the unit."""
 ADDRESS_SHARE: Final = 0.2
 """Share of these among the parameters that are set."""
+CONTENT_SHARE: Final = 0.03
+"""Share of steps before which the content of telemetry, or the clock, becomes wrong."""
 READ_BACK_SHARE: Final = 0.5
 """Share of telecommands after which a row that reports their effect is read."""
 EFFECTS: Final = {
@@ -75,14 +77,14 @@ EFFECTS: Final = {
     "set_mode": ("mode",),
     "clear_counters": ("counters.",),
 }
-"""Beginnings of the quantities that report the effect of an action."""
+"""Prefixes of the names of quantities that report the effect of an action."""
 NMT_COMMANDS: Final = (0x01, 0x80)
 """Start the node, and enter pre-operational; in both states SDO works."""
 EDGE_CLOCKS_S: Final = (0, 2**31 - 2, 2**31, 2**32 - 2, 2**32, 1_767_225_600)
 """Clock settings next to the wraps of 2038 and 2106."""
 
 
-UNRECORDED: Final = frozenset({"disk", "end_pipeline"})
+UNRECORDED_STEPS: Final = frozenset({"disk", "end_pipeline"})
 """Steps that a recording does not contain: it would be on the full disk itself, and has no events of the pipeline."""
 
 
@@ -93,9 +95,7 @@ class Life:
     unit: str
     """Name or folder."""
     seed: int
-    """Seed of the life and of the noise in it."""
     links: tuple[str, ...]
-    """The links that are open."""
     profile: dict[str, Any]
     steps: tuple[Step, ...]
     rendered: bool = False
@@ -163,14 +163,17 @@ class LifeGenerator:
         self._definition = definition
         self._links = links
         self._random = random_of_life
+        self._random_of_content = random.Random(repr(random_of_life.getstate()[1][:4]))  # noqa: S311 (reproducible)
+        """Numbers of its own, so that the steps around these faults are those of a life without them."""
+        self._is_long = is_long
         self._telemetry = list(definition.readable.values())
         self._telecommands = list(definition.telecommands.values())
         self._attitude_rows = [
             row for row in self._telemetry if any(field.value == "attitude.valid" for field in row.fields)
         ]
-        self._count_rows = self._reporting(COUNTING)
+        self._count_rows = self._reporting(COUNTING_QUANTITIES)
         self._effects = {
-            (row.klass, row.id, row.kind): self._reporting(EFFECTS.get(row.action or "", ()))
+            (row.message_class, row.id, row.kind): self._reporting(EFFECTS.get(row.action or "", ()))
             for row in self._telecommands
         }
         """Rows that report the effect of a telecommand."""
@@ -220,6 +223,8 @@ class LifeGenerator:
     def steps(self) -> Iterator[Step]:
         """Generate steps without end; the effect of a telecommand is often read back, as an OBC does."""
         while True:
+            if not self._is_long and self._random_of_content.random() < CONTENT_SHARE:
+                yield {"do": "fault", "fault": self._content_fault()}
             (maker,) = self._random.choices(self._makers, self._weights)
             step = maker()
             yield step
@@ -229,7 +234,7 @@ class LifeGenerator:
                 yield self._request(self._random.choice(effects))
 
     def _reporting(self, beginnings: tuple[str, ...]) -> list[Row]:
-        """Return the telemetry that reports a quantity with one of these beginnings."""
+        """Return the telemetry that reports a quantity with one of these prefixes."""
         return [
             row
             for row in self._telemetry
@@ -247,10 +252,14 @@ class LifeGenerator:
         return {"do": "wait", "s": round(self._random.uniform(*LONG_WAIT_S), 3), "most": most}
 
     def _request(self, row: Row, data: bytes = b"") -> Step:
-        return self._raw_request(row.klass, row.id, row.kind, data)
+        return self._raw_request(row.message_class, row.id, row.kind, data)
 
-    def _raw_request(self, klass: str, row_id: int, kind: str, data: bytes) -> Step:
-        step: Step = {"do": "request", "link": self._random.choice(self._links), "row": [klass, row_id, kind]}
+    def _raw_request(self, message_class: str, row_id: int, kind: str, data: bytes) -> Step:
+        step: Step = {
+            "do": "request",
+            "link": self._random.choice(self._links),
+            "row": [message_class, row_id, kind],
+        }
         return {**step, "data": data.hex()} if data else step
 
     def _read_any(self) -> Step:
@@ -311,7 +320,7 @@ class LifeGenerator:
             for other in self._count_rows
             for field in other.fields
         )
-        count = self._random.randint(*FLOOD) if narrow else FLOOD[0] // 20
+        count = self._random.randint(*FLOOD_REQUESTS) if narrow else FLOOD_REQUESTS[0] // 20
         data = bytes(row.size) if row.kind == "telecommand" else b""
         return {**self._request(row, data), "do": "flood", "link": link, "count": count}
 
@@ -327,7 +336,7 @@ class LifeGenerator:
     def _burst(self) -> Step:
         rows = [self._random.choice(self._telemetry) for _ in range(self._random.randint(2, 6))]
         link = self._random.choice([link for link in self._links if link != "canopen"] or self._links[:1])
-        return {"do": "burst", "link": link, "rows": [[row.klass, row.id, row.kind] for row in rows]}
+        return {"do": "burst", "link": link, "rows": [[row.message_class, row.id, row.kind] for row in rows]}
 
     # --- values ---
 
@@ -386,14 +395,16 @@ class LifeGenerator:
         match self._random.randrange(3):
             case 0:
                 on_wire = any(item.code is not None for item in self._definition.classes)
-                known = {other.id for other in rows if not on_wire or other.klass == row.klass}
+                known = {
+                    other.id for other in rows if not on_wire or other.message_class == row.message_class
+                }
                 unknown = [number for number in range(256) if number not in known]
                 number = self._random.choice(unknown) if unknown else row.id
                 kind = row.kind
                 if not self._definition.classes:
                     is_telemetry = self._definition.is_telemetry("", number)
                     kind = "telemetry" if is_telemetry else "telecommand"
-                return self._raw_request(row.klass, number, kind, b"")
+                return self._raw_request(row.message_class, number, kind, b"")
             case 1:
                 size = row.size if row.kind == "telecommand" else 0
                 # one byte more may be a CRC
@@ -445,6 +456,25 @@ class LifeGenerator:
                 {link: {"delay_s": self._random.uniform(0.0, 3.0), "split": 3 if link == "serial" else 0}}
             )
         return {"do": "fault", "fault": self._random.choice(kinds)}
+
+    def _content_fault(self) -> dict[str, Any]:
+        """Return a fault of the content of telemetry, or of the clock, whose effect is known exactly."""
+        chance = self._random_of_content
+        kinds: list[dict[str, Any]] = [
+            {"telemetry": [{"turn_deg": [round(chance.gauss(0.0, 10.0), 3) for _ in range(3)]}]},
+            {"telemetry": []},
+            {"clock": {"drift_ppm": round(chance.uniform(-200.0, 200.0), 3)}},
+            {"clock": {"jump_s": chance.choice([-0.25, 0.5, 30.0])}},
+        ]
+        if "canopen" not in self._links:
+            row = chance.choice(self._telemetry)
+            kinds.append({"telemetry": [{"row": row.name, "freeze": "all"}]})
+            numbers = [
+                name for name, field in row.named.items() if field.kind == "float" and field.scale == 1.0
+            ]
+            if numbers:
+                kinds.append({"telemetry": [{"row": row.name, "set": {chance.choice(numbers): 0.25}}]})
+        return chance.choice(kinds)
 
     def _power(self) -> Step:
         return {"do": "power", "factory": self._random.random() < 0.4}

@@ -1,9 +1,8 @@
-"""What a CANopen node sends by itself, decoded by the default mapping of its definition: PDOs, EMCY, heartbeats.
+"""What a CANopen node sends unprompted, decoded by the default mapping of its definition: PDOs, EMCY, heartbeats.
 
 A TPDO carries entries of the object dictionary, each a field of a telemetry row or the same in a narrower type. The
 values of the TPDOs of one instant are judged as one row, so that an attitude spread over two of them is compared, and
-modes that last for no time are left out.
-Lives do not change the mapping.
+modes of zero duration are ignored. Lives do not change the mapping.
 """
 
 from __future__ import annotations

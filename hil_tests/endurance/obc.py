@@ -1,8 +1,8 @@
-"""The OBC of a life: sends requests on every link, and judges what comes back and what comes by itself.
+"""The OBC of a life: sends requests on every link, and judges replies and unsolicited messages.
 
-Each request gets exactly the answers that the definition names; the oracle says whether it must be accepted. On a
-link that a fault disturbs, and after a request with an unknown outcome, nothing is judged but the oracle forgets.
-What comes without a request is heard at the end of each step, in the order of its times, and judged as of then.
+Each request must get exactly the answers that the definition names; the oracle decides whether it must be accepted. On a
+link disturbed by a fault, and after a request with an unknown outcome, nothing is judged, and the oracle no longer relies
+on what may have changed. Unsolicited messages are read at the end of each step, in order of time, and judged as of then.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Obc:
                 return CanopenPort(self._definition, self._objects, deliver, take, int(address))
 
     async def pass_time(self, seconds: float, *, most: int | None = None) -> None:
-        """Let time pass, and judge what comes meanwhile."""
+        """Let time pass, and judge the messages that arrive in it."""
         await self._unit.step(seconds, most=most)
         self.hear()
         self._oracle.time_passed(self._unit.now_s)
@@ -82,14 +82,14 @@ class Obc:
     # --- what comes without a request ---
 
     def hear(self) -> None:
-        """Judge what has come without a request, in the order of its times."""
-        heard: list[tuple[float, str, Answer | CanFrame]] = []
+        """Judge the messages that no request has caused, in order of time."""
+        messages: list[tuple[float, str, Answer | CanFrame]] = []
         for link in self._unit.links:
             port = self._ports[link]
-            heard += [(at_s, link, event) for at_s, event in port.answers()]
+            messages += [(at_s, link, event) for at_s, event in port.answers()]
             if isinstance(port, CanopenPort):
-                heard += [(at_s, link, frame) for at_s, frame in port.messages()]
-        for at_s, link, event in sorted(heard, key=lambda item: item[0]):
+                messages += [(at_s, link, frame) for at_s, frame in port.messages()]
+        for at_s, link, event in sorted(messages, key=lambda item: item[0]):
             if at_s > self._oracle.now_s:
                 self._end_instant()
             if link not in self._oracle.disturbed:
@@ -113,7 +113,7 @@ class Obc:
             if not self._oracle.bursts:
                 raise Violation(f"{link}: a packet of a file that nobody requested")
             return
-        row = self._definition.by_key.get((event.klass, event.row_id or 0))
+        row = self._definition.by_key.get((event.message_class, event.row_id or 0))
         if event.kind != "unsolicited":
             raise Violation(f"{link}: {event} without a request")
         if row is None or row.kind != "telemetry":
@@ -130,21 +130,21 @@ class Obc:
 
     async def request(self, link: str, row: Sequence[Any], data: str = "") -> None:
         """Send a request, data in hexadecimal, and judge the answers."""
-        klass, row_id, kind = row
-        request = Request(row_id, bytes.fromhex(data), klass, telemetry=kind == "telemetry")
-        known = self._definition.by_key.get((klass, row_id))
-        if known is not None and known.kind != kind:
-            known = None
-        if link == "canopen" and not self._in_dictionary(known, request):
+        message_class, row_id, kind = row
+        request = Request(row_id, bytes.fromhex(data), message_class, telemetry=kind == "telemetry")
+        defined_row = self._definition.by_key.get((message_class, row_id))
+        if defined_row is not None and defined_row.kind != kind:
+            defined_row = None
+        if link == "canopen" and not self._in_dictionary(defined_row, request):
             return
-        verdict = self._oracle.verdict(known, request)
+        verdict = self._oracle.verdict(defined_row, request)
         try:
             self._ports[link].ask(request)
         except (ValueError, OverflowError):
             return  # the header has no room for such an ID
         self._outcome.requests += 1
         counts = link != "canopen" or not (
-            request.telemetry or known is None or self._oracle.is_outside(known, request.data)
+            request.telemetry or defined_row is None or self._oracle.is_outside(defined_row, request.data)
         )
         if counts and not self._oracle.stuck:
             self._oracle.counted(request)
@@ -156,7 +156,7 @@ class Obc:
         elif link in self._oracle.disturbed:
             await self._unknown_outcome(link, request)
         else:
-            await self._judge(link, known, request, verdict, answers, counts=counts)
+            await self._judge(link, defined_row, request, verdict, answers, counts=counts)
 
     def _in_dictionary(self, row: Row | None, request: Request) -> bool:
         """Return whether a request can be made by SDO."""
@@ -174,14 +174,14 @@ class Obc:
         await self.settle(link)
 
     def _answers(self, link: str) -> list[Answer]:
-        """Return the answers on a link; packets of files that follow them are judged apart."""
-        found: list[Answer] = []
+        """Return the answers on a link; packets of files that follow them are judged separately."""
+        answers: list[Answer] = []
         for _, event in self._ports[link].answers():
             if event.kind not in ("unsolicited", "burst"):
-                found.append(event)
+                answers.append(event)
             elif link not in self._oracle.disturbed:
                 self._judge_unasked(link, event)
-        return found
+        return answers
 
     async def _judge(
         self,
@@ -231,7 +231,9 @@ class Obc:
         elif not replies:
             if expected and verdict == "ok":
                 yield "no answer"
-            refusable = (line is None or line.envelope.can_refuse(request.klass)) and not self._fixed_framing
+            refusable = (
+                line is None or line.envelope.can_refuse(request.message_class)
+            ) and not self._fixed_framing
             if expected and verdict is not None and refusable:
                 yield "no answer, must be refused"
         elif expected != ("echo",) and verdict not in (None, "ok"):
@@ -266,12 +268,12 @@ class Obc:
             oracle.time_passed(self._unit.now_s)
             self.connect()
         elif any(field.parameter in ADDRESSES for field in row.named.values()) or row.action in _SETTERS:
+            self.connect()  # what follows the answer comes in the new format, from the new address
             await self.pass_time(TURN_S)
-            self.connect()
 
     def _read(self, what: str, row: Row | None, request: Request, reply: Answer) -> None:
         number = request.id if reply.row_id is None else reply.row_id
-        other = self._definition.by_key.get((reply.klass or request.klass, number)) or row
+        other = self._definition.by_key.get((reply.message_class or request.message_class, number)) or row
         named = set() if row is None else {item.partition(":")[2] or row.name for item in row.answers}
         if other is None or other.kind != "telemetry" or other.name not in named:
             raise Violation(f"{what}: {reply}")
@@ -284,14 +286,16 @@ class Obc:
         """Send telemetry requests without waiting; the answers come in order."""
         if link == "canopen" or self._oracle.stuck or link in self._oracle.disturbed:
             return
-        known = [self._definition.by_key[klass, row_id] for klass, row_id, _ in rows]
-        asked = [row for row in known if self._oracle.verdict(row, self._definition.request(row)) == "ok"]
-        self._outcome.requests += len(asked)
-        self._ports[link].ask(*(self._definition.request(row) for row in asked))
+        known = [self._definition.by_key[message_class, row_id] for message_class, row_id, _ in rows]
+        answerable = [
+            row for row in known if self._oracle.verdict(row, self._definition.request(row)) == "ok"
+        ]
+        self._outcome.requests += len(answerable)
+        self._ports[link].ask(*(self._definition.request(row) for row in answerable))
         replies = self._answers(link)
-        if len(replies) != len(asked) or any(reply.kind != "telemetry" for reply in replies):
-            raise Violation(f"{link}: {len(replies)} answers to {len(asked)} requests")
-        for row, reply in zip(asked, replies, strict=True):
+        if len(replies) != len(answerable) or any(reply.kind != "telemetry" for reply in replies):
+            raise Violation(f"{link}: {len(replies)} answers to {len(answerable)} requests")
+        for row, reply in zip(answerable, replies, strict=True):
             self._oracle.counted(self._definition.request(row))
             if reply.row_id not in (None, row.id) or len(reply.data) != row.size:
                 raise Violation(f"{link}: {reply} where {row.name} was next")
@@ -305,7 +309,7 @@ class Obc:
             await self.request(link, row, data)
 
     async def cut(self, link: str, row: Sequence[Any], share: float) -> None:
-        """Send the first part of a request, as a client that goes away, which a bus must not see answered."""
+        """Send the first part of a request, as a client that disconnects does; on a bus it must not be answered."""
         if link in self._oracle.disturbed:
             return
         known = self._definition.by_key[row[0], row[1]]

@@ -1,6 +1,6 @@
 """The OBC's end of each link of a unit in memory: requests out, answers in, each with the time at which it was sent.
 
-Requests are encoded and answers decoded by the judge, not by the product's codecs, so that an error of a codec is seen.
+Requests are encoded and answers decoded by the judge, not by the product's codecs, so that errors of a codec are found.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from starhil.protocol.can.frame import CanFrame
 
 HOST: Final = 1
 """CAN address of the OBC."""
-Heard = tuple[float, Answer]
+TimedAnswer = tuple[float, Answer]
 Deliver = Callable[[Any], None]
 Take = Callable[[], Sequence[tuple[float, Any]]]
 
@@ -37,7 +37,7 @@ class SerialPort:
         data = self.line.encode(request)
         self._deliver(data[: max(1, int(share * len(data)))])
 
-    def answers(self) -> list[Heard]:
+    def answers(self) -> list[TimedAnswer]:
         """Return what has arrived."""
         return [(at_s, answer) for at_s, chunk in self._take() for answer in self.line.feed(chunk)]
 
@@ -69,25 +69,25 @@ class CanPort:
         if can_id & 0xFF not in (0, self.device):
             self._deliver(CanFrame(can_id, data))
 
-    def answers(self) -> list[Heard]:
+    def answers(self) -> list[TimedAnswer]:
         """Return what has arrived; a frame of another source, or an answer to another OBC, is malformed."""
 
         def is_unasked(frame: CanFrame) -> bool:
             return frame.id >> 24 in can.UNSOLICITED and frame.id >> 8 & 0xFF == self.device
 
         taken = list(self._take())
-        asked = iter([item for item in taken if not is_unasked(item[1])])
-        found = []
-        for at_s, frame in asked:
+        solicited = iter([item for item in taken if not is_unasked(item[1])])
+        timed_answers = []
+        for at_s, frame in solicited:
             if frame.id & 0xFFFF == self.device << 8 | HOST:
-                answer = can.read_answer(frame, lambda: next(asked, (0.0, None))[1])
+                answer = can.read_answer(frame, lambda: next(solicited, (0.0, None))[1])
             else:
                 answer = Answer("malformed", data=frame.id.to_bytes(4, "big") + frame.data)
-            found.append((at_s, answer))
+            timed_answers.append((at_s, answer))
         for instant in dict.fromkeys(at_s for at_s, _ in taken):
             frames = [frame for at_s, frame in taken if at_s == instant and is_unasked(frame)]
-            found += [(instant, answer) for answer in can.unsolicited(frames)]
-        return found
+            timed_answers += [(instant, answer) for answer in can.unsolicited(frames)]
+        return timed_answers
 
 
 Objects = dict[tuple[str, str], list[canopen.Entry]]
@@ -101,7 +101,7 @@ class CanopenPort:
         self._unit, self._objects = unit, objects
         self._deliver, self._take = deliver, take
         self.node = node
-        self._answers: list[Heard] = []
+        self._answers: list[TimedAnswer] = []
         self._others: list[tuple[float, CanFrame]] = []
         self._at_s = 0.0
 
@@ -112,12 +112,12 @@ class CanopenPort:
             if row is None:
                 raise ValueError(f"{request}: no such row")
             try:
-                found = self._objects[row.kind, row.name]
+                entries = self._objects[row.kind, row.name]
                 if row.is_telemetry:
-                    answer = Answer("telemetry", data=canopen.row_data(row, found, self._read))
+                    answer = Answer("telemetry", data=canopen.row_data(row, entries, self._read))
                 else:
-                    data = canopen.written(found[0], row, request.data)
-                    canopen.download(self._exchange, found[0].index, found[0].subindex, data)
+                    data = canopen.written(entries[0], row, request.data)
+                    canopen.download(self._exchange, entries[0].index, entries[0].subindex, data)
                     answer = Answer("ack")
             except canopen.AbortedError as abort:
                 answer = Answer("nack", abort.code)
@@ -160,16 +160,16 @@ class CanopenPort:
                 self._others.append((at_s, frame))
         return responses
 
-    def answers(self) -> list[Heard]:
+    def answers(self) -> list[TimedAnswer]:
         """Return the answers to the requests since the last call."""
-        found, self._answers = self._answers, []
-        return found
+        timed_answers, self._answers = self._answers, []
+        return timed_answers
 
     def messages(self) -> list[tuple[float, CanFrame]]:
         """Return what the node has sent apart from SDO since the last call: PDOs, EMCY, heartbeats."""
         self._sort()
-        found, self._others = self._others, []
-        return found
+        messages, self._others = self._others, []
+        return messages
 
     def set_state(self, command: int) -> None:
         """Send an NMT command to the node."""
@@ -186,12 +186,12 @@ def objects_of(unit: Unit) -> Objects:
     if records:
         return {(row.kind, row.name): [canopen.whole_row(records[0], row.id, row)] for row in unit.rows}
     every = list(canopen.entries(unit, layout))
-    found: Objects = {}
+    objects: Objects = {}
     for row in unit.rows:
         held = {slot.offset: item for item, slot in reversed(canopen.slots(row, every))}
         setters = [item for item in every if item.command is row]
         if row.is_telemetry and held.keys() >= {place.offset for place in canopen.places(row)} and held:
-            found[row.kind, row.name] = list(held.values())
+            objects[row.kind, row.name] = list(held.values())
         elif setters and (setters[0].part is None or len(canopen.places(row)) == 1):
-            found[row.kind, row.name] = setters[:1]
-    return found
+            objects[row.kind, row.name] = setters[:1]
+    return objects

@@ -12,7 +12,6 @@ class LiveUnit(Protocol):
     """A unit with its power and surroundings, in simulated time."""
 
     links: tuple[str, ...]
-    """Names of the open links."""
 
     @property
     def now_s(self) -> float:

@@ -55,7 +55,7 @@ def shortened(life: Life, fails: Callable[[Life], bool], *, attempts: int = 400)
 def session_of(life: Life, definition: Unit, violation: str) -> str:
     """Return a session script with the requests of a life on serial and CAN, and its waits.
 
-    What a session cannot do (faults, truth, power, CANopen) stands in a comment where it was done.
+    What a session cannot do (faults, truth, power, CANopen) is a comment at its place.
     """
     lines = [
         f"title = {json.dumps(f'{life.unit}, seed {life.seed}')}",
@@ -71,8 +71,10 @@ def session_of(life: Life, definition: Unit, violation: str) -> str:
             case "wait":
                 lines += ["", "[[step]]", name, f"wait_s = {min(step['s'], LONGEST_WAIT_S)}"]
             case "request" if step["link"] != "canopen":
-                klass, row_id, kind = step["row"]
-                request = Request(row_id, bytes.fromhex(step.get("data", "")), klass, kind == "telemetry")
+                message_class, row_id, kind = step["row"]
+                request = Request(
+                    row_id, bytes.fromhex(step.get("data", "")), message_class, kind == "telemetry"
+                )
                 if step["link"] == "serial":
                     sent = [SerialLine(definition).encode(request).hex(" ")]
                 else:

@@ -95,13 +95,13 @@ def _joined(first: Frame, following: Callable[[], Frame | None]) -> Answer:
 
 def unsolicited(frames: list[Frame]) -> list[Answer]:
     """Return the messages in frames of unsolicited telemetry; one without its beginning or end is left out."""
-    found, data = [], b""
+    answers, data = [], b""
     for frame in frames:
         kind, number, other = frame.id >> 24, frame.id >> 16 & 0xFF, frame.id & 0xFF
         if kind in (UNSOLICITED_FIRST, UNSOLICITED_BODY):
             data += frame.data[:-1]
         elif kind == UNSOLICITED_LAST:
             whole = data + frame.data[:-1] if data else frame.data
-            found.append(Answer("unsolicited", data=whole, row_id=number, other=other))
+            answers.append(Answer("unsolicited", data=whole, row_id=number, other=other))
             data = b""
-    return found
+    return answers

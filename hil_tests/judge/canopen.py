@@ -28,7 +28,6 @@ SDO_SIZE: Final = 8
 EXPEDITED, SEGMENT = 4, 7
 """Maximum number of bytes in an expedited SDO, and in a segment."""
 ABORT: Final = 0x80
-"""Command of an abort."""
 
 Exchange = Callable[[bytes], bytes | None]
 """Sends an SDO request, and returns the response, None without one; it fills the request up to 8 bytes."""
@@ -95,16 +94,16 @@ def download(exchange: Exchange, index: int, subindex: int, data: bytes) -> None
     if len(data) > EXPEDITED:
         command, first = 0x21, len(data).to_bytes(4, "little")
         pieces = [data[start : start + SEGMENT] for start in range(0, len(data), SEGMENT)]
-    seen = exchange(bytes([command]) + mux + first)
-    _checked(seen, f"an answer to writing {name}", 0xFF, 0x60, mux)
+    response = exchange(bytes([command]) + mux + first)
+    _checked(response, f"an answer to writing {name}", 0xFF, 0x60, mux)
     for number, piece in enumerate(pieces, 1):
         toggle = 0 if number % 2 else 0x10
-        seen = exchange(bytes([toggle | SEGMENT - len(piece) << 1 | (number == len(pieces))]) + piece)
-        _checked(seen, f"a confirmed segment of {name}", 0xFF, 0x20 | toggle, mux, named=False)
+        response = exchange(bytes([toggle | SEGMENT - len(piece) << 1 | (number == len(pieces))]) + piece)
+        _checked(response, f"a confirmed segment of {name}", 0xFF, 0x20 | toggle, mux, named=False)
 
 
 def _checked(
-    seen: bytes | None,
+    response: bytes | None,
     expected: str,
     mask: int,
     command: int,
@@ -113,13 +112,13 @@ def _checked(
     named: bool = True,
 ) -> bytes:
     """Return a response with this command, `named` with its object; it may be an abort if an object is given."""
-    if seen is not None and len(seen) == SDO_SIZE:
-        names = mux is None or seen[1:4] == mux
-        if seen[0] == ABORT and mux is not None and names and abort_code(seen):
-            raise AbortedError(abort_code(seen))
-        if seen[0] & mask == command and (names or not named):
-            return seen
-    raise BadResponseError(expected, seen)
+    if response is not None and len(response) == SDO_SIZE:
+        names = mux is None or response[1:4] == mux
+        if response[0] == ABORT and mux is not None and names and abort_code(response):
+            raise AbortedError(abort_code(response))
+        if response[0] & mask == command and (names or not named):
+            return response
+    raise BadResponseError(expected, response)
 
 
 # --- the object dictionary of a unit ---
@@ -230,11 +229,11 @@ def with_byte_order(slot: Field | None, data: bytes) -> bytes:
     return data[::-1] if slot is not None and slot.order == "big" and slot.type != "bytes" else data
 
 
-def slots(row: Row, found: Iterable[Entry]) -> list[tuple[Entry, Field]]:
+def slots(row: Row, entries: Iterable[Entry]) -> list[tuple[Entry, Field]]:
     """Return the entries that hold slots of a row, given by its name, and the slots."""
     return [
         (entry, entry.slot)
-        for entry in found
+        for entry in entries
         if entry.row is not None and entry.row.name == row.name and entry.slot is not None
     ]
 

@@ -1,8 +1,8 @@
 """The definition as data: the one module of the judge that knows the types of `starhil.protocol`.
 
 It copies what the TOML files say, field by field. What follows from it (offsets, bit positions, sizes) is counted
-here from the order of the fields, so that an error of the product's layout is not copied. Shared on purpose, and
-said so in docs/rules.md: the reader of the TOML files; the framing and check of a unit's own plugin.
+here from the order of the fields, so that an error of the product's layout is not copied. Deliberately shared, as
+docs/rules.md says: the reader of the TOML files, and the framing and check of a unit's own plugin.
 """
 
 from __future__ import annotations
@@ -116,18 +116,18 @@ class Unit:
     @cached_property
     def by_key(self) -> Mapping[tuple[str, int], Row]:
         """Rows by class and ID."""
-        return {(row.klass, row.id): row for row in self.rows}
+        return {(row.message_class, row.id): row for row in self.rows}
 
     def row(self, request: Request) -> Row | None:
         """Return the row of a request; without a class, the first row with its ID."""
-        found = self.by_key.get((request.klass, request.id))
-        if found is None and not request.klass:
+        found = self.by_key.get((request.message_class, request.id))
+        if found is None and not request.message_class:
             found = next((row for row in self.rows if row.id == request.id), None)
         return found
 
-    def is_telemetry(self, klass: str, row_id: int) -> bool:
+    def is_telemetry(self, message_class: str, row_id: int) -> bool:
         """Return whether an ID, which need not belong to a row, is telemetry."""
-        kind = next((item.kind for item in self.classes if item.name == klass), None)
+        kind = next((item.kind for item in self.classes if item.name == message_class), None)
         if kind is not None:
             return str(kind.value) == "telemetry"
         if self.first_telemetry_id is not None:
@@ -144,13 +144,13 @@ class Unit:
 
         The row includes the fields of the telecommand, or has the same parameters in the same layout.
         """
-        found = {}
+        reports = {}
         for row in self.readable.values():
             for name in {
                 item.telecommand: None for item in row.named.values() if item.telecommand is not None
             }:
                 command = self.telecommands[name]
-                found[name, row.name] = command, row, {field: field for field in command.named}
+                reports[name, row.name] = command, row, {field: field for field in command.named}
         for command in self.telecommands.values():
             fields = {
                 item.of_parameter: item.name for item in command.named.values() if item.parameter is not None
@@ -162,14 +162,14 @@ class Unit:
                     if item.of_parameter in fields
                 }
                 if len(places) == len(fields):
-                    found[command.name, row.name] = command, row, places
-        return tuple(found.values())
+                    reports[command.name, row.name] = command, row, places
+        return tuple(reports.values())
 
-    def request(self, row: Row | int, data: bytes = b"", klass: str = "") -> Request:
+    def request(self, row: Row | int, data: bytes = b"", message_class: str = "") -> Request:
         """Return the request for a row, or for an ID, which need not belong to one."""
         if isinstance(row, int):
-            return Request(row, data, klass, self.is_telemetry(klass, row))
-        return Request(row.id, data, row.klass, row.is_telemetry)
+            return Request(row, data, message_class, self.is_telemetry(message_class, row))
+        return Request(row.id, data, row.message_class, row.is_telemetry)
 
     def code(self, error: str) -> int:
         """Return the unit's number for an error."""
@@ -222,7 +222,7 @@ def _parameter(item: Any) -> Parameter:
 
 def _row(row: Any, icd: InterfaceDefinition) -> Row:
     return Row(
-        row.kind, row.id, row.name, tuple(_fields(row, icd)), row.klass, row.provenance, row.source, row.action, row.arguments,
+        row.kind, row.id, row.name, tuple(_fields(row, icd)), row.message_class, row.provenance, row.source, row.action, row.arguments,
         row.answers, row.request, row.unsolicited, row.only_sent, row.min_size,
     )  # fmt: skip
 

@@ -27,7 +27,7 @@ class Opened:
     """A header that was read: values by role, name of the class, and size."""
 
     values: Mapping[str, int]
-    klass: str
+    message_class: str
     size: int
 
 
@@ -48,12 +48,12 @@ class Header:
         self._models, self._order = models, order
         self._codes, self._sizes = codes, sizes
 
-    def _in(self, klass: str) -> Iterator[Any]:
-        return (model for model in self._models if model.classes is None or klass in model.classes)
+    def _in(self, message_class: str) -> Iterator[Any]:
+        return (model for model in self._models if model.classes is None or message_class in model.classes)
 
-    def roles(self, klass: str | None = None) -> set[str]:
+    def roles(self, message_class: str | None = None) -> set[str]:
         """Return the roles in messages of a class, or of any."""
-        models = self._models if klass is None else self._in(klass)
+        models = self._models if message_class is None else self._in(message_class)
         return {part.role for model in models for part in (model, *model.bits) if part.role is not None}
 
     def counted(self) -> set[str]:
@@ -66,32 +66,32 @@ class Header:
         bits = [bit.width for model in self._models for bit in model.bits if bit.role == role]
         return max(fields + bits, default=0)
 
-    def data_sizes(self, klass: str) -> range:
+    def data_sizes(self, message_class: str) -> range:
         """Return the numbers of bytes of data that the length field of a class can state; any if there is none."""
-        model = next((item for item in self._in(klass) if item.role == "length"), None)
+        model = next((item for item in self._in(message_class) if item.role == "length"), None)
         if model is None or "data" not in model.includes:
             return range(1 << 16)
         bits = 8 * _size(model) - model.type.startswith("i")
-        others = self._counted(model, self.size(klass), 0)
+        others = self._counted(model, self.size(message_class), 0)
         return range(max(0, -others), (1 << bits) - others)
 
-    def place(self, model: Any, klass: str) -> tuple[int, int]:
+    def place(self, model: Any, message_class: str) -> tuple[int, int]:
         """Return offset and size of a field in messages of a class."""
-        before = [_size(item) for item in self._in(klass)]
-        number = list(self._in(klass)).index(model)
+        before = [_size(item) for item in self._in(message_class)]
+        number = list(self._in(message_class)).index(model)
         return sum(before[:number]), _size(model)
 
-    def size(self, klass: str) -> int:
+    def size(self, message_class: str) -> int:
         """Return the bytes of the header in messages of a class."""
-        return sum(_size(model) for model in self._in(klass))
+        return sum(_size(model) for model in self._in(message_class))
 
-    def write(self, values: Mapping[str, int], klass: str, data_size: int) -> bytes:
+    def write(self, values: Mapping[str, int], message_class: str, data_size: int) -> bytes:
         """Return the header of a message; a role without a value has its default.
 
         Raises InexpressibleError for a value that does not fit its field.
         """
         line = b""
-        for model in self._in(klass):
+        for model in self._in(message_class):
             number = 0
             if model.bits:
                 shift = 0
@@ -102,7 +102,7 @@ class Header:
                     number |= value << shift
                     shift += bit.width
             elif model.role == "length":
-                number = self._counted(model, self.size(klass), data_size)
+                number = self._counted(model, self.size(message_class), data_size)
             else:
                 number = _sent(model, values)
             try:
@@ -113,7 +113,7 @@ class Header:
                 raise InexpressibleError(f"{model.role} {number} does not fit {model.type}") from None
         return line
 
-    def read(self, body: bytes, klass: str = "") -> Opened | None:
+    def read(self, body: bytes, message_class: str = "") -> Opened | None:
         """Read a header, of a message whose class may be known; return None if more bytes are needed.
 
         Raises ValueError for a constant or class that the definition does not have.
@@ -121,7 +121,7 @@ class Header:
         values: dict[str, int] = {}
         position = 0
         for model in self._models:
-            if model.classes is not None and klass not in model.classes:
+            if model.classes is not None and message_class not in model.classes:
                 continue
             piece = body[position : position + _size(model)]
             if len(piece) < _size(model):
@@ -132,15 +132,15 @@ class Header:
             for bit in model.bits:
                 _note(bit, number & (1 << bit.width) - 1, values)
                 number >>= bit.width
-            if "class" in values and not klass:
-                klass = next((name for name, code in self._codes if code == values["class"]), "")
-                if not klass:
+            if "class" in values and not message_class:
+                message_class = next((name for name, code in self._codes if code == values["class"]), "")
+                if not message_class:
                     raise ValueError(f"class {values['class']}")
-        return Opened(values, klass, position)
+        return Opened(values, message_class, position)
 
     def data_size(self, opened: Opened) -> int | None:
         """Return the bytes of data that the length in a header gives; None if it has no length."""
-        model = next((item for item in self._in(opened.klass) if item.role == "length"), None)
+        model = next((item for item in self._in(opened.message_class) if item.role == "length"), None)
         return None if model is None else opened.values["length"] - self._counted(model, opened.size, 0)
 
     def _counted(self, model: Any, header: int, data: int) -> int:

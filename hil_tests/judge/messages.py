@@ -33,12 +33,12 @@ class Request:
 
     id: int
     data: bytes = b""
-    klass: str = ""
+    message_class: str = ""
     telemetry: bool = False
     sequence: int = 0
 
     def __str__(self) -> str:
-        return f"{self.klass} {self.id}".strip()
+        return f"{self.message_class} {self.id}".strip()
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Answer:
         Error code of a refusal.
     data
         Telemetry, or the malformed bytes.
-    row_id, klass
+    row_id, message_class
         Row in the answer; None and empty if the link does not name it.
     other
         CAN address to which it was sent; 0 on serial.
@@ -73,7 +73,7 @@ class Answer:
     code: int = 0
     data: bytes = b""
     row_id: int | None = None
-    klass: str = ""
+    message_class: str = ""
     other: int = 0
     final: bool = True
     time_s: float = 0.0
@@ -82,7 +82,7 @@ class Answer:
     fault: str = ""
 
     def __str__(self) -> str:
-        where = "" if self.row_id is None else f" of {self.klass} {self.row_id}".replace("  ", " ")
+        where = "" if self.row_id is None else f" of {self.message_class} {self.row_id}".replace("  ", " ")
         match self.kind:
             case "nack":
                 return f"refusal{where} with code {self.code}"

@@ -33,7 +33,7 @@ FORMATS: Final = {
     ("big", "f64"): ">d",
 }
 """Format of floating types in `struct`, by byte order."""
-LARGEST: Final = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": math.inf}
+LARGEST_OF_FORMAT: Final = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": math.inf}
 """Largest finite number of each floating type; any finite number fits f64."""
 PARAMETER: Final = "parameter."
 """Beginning of the name of a quantity that is a parameter."""
@@ -126,7 +126,7 @@ class Field:
     def limits(self) -> tuple[float, float]:
         """Lowest and highest physical number."""
         if self.kind == "float":
-            widest = LARGEST[self.type]
+            widest = LARGEST_OF_FORMAT[self.type]
             low, high = self.minimum, self.maximum
             return -widest if low is None else low, widest if high is None else high
         low, high = sorted(raw * self.scale + self.bias for raw in self.raw_limits)
@@ -172,7 +172,7 @@ class Field:
         place = slice(self.offset, self.offset + self.size)
         if isinstance(raw, bytes):
             data[place] = raw.ljust(self.size, b"\0")
-        elif self.type in LARGEST:
+        elif self.type in LARGEST_OF_FORMAT:
             data[place] = struct.pack(FORMATS[self.order, self.type], raw)
         elif self.width:
             others = int.from_bytes(data[place], self.order) & ~((1 << self.width) - 1 << self.shift)
@@ -185,7 +185,7 @@ class Field:
         piece = data[self.offset : self.offset + self.size]
         if self.type == "bytes":
             return piece
-        if self.type in LARGEST:
+        if self.type in LARGEST_OF_FORMAT:
             return float(struct.unpack(FORMATS[self.order, self.type], piece)[0])
         number = int.from_bytes(piece, self.order, signed=self.type.startswith("i") and not self.width)
         return number >> self.shift & (1 << self.width) - 1 if self.width else number
@@ -262,7 +262,9 @@ class Field:
 def single(number: float) -> float:
     """Round to single precision."""
     return (
-        float(struct.unpack("<f", struct.pack("<f", number))[0]) if abs(number) <= LARGEST["f32"] else number
+        float(struct.unpack("<f", struct.pack("<f", number))[0])
+        if abs(number) <= LARGEST_OF_FORMAT["f32"]
+        else number
     )
 
 
@@ -292,7 +294,7 @@ class Row:
     id: int
     name: str
     fields: tuple[Field, ...]
-    klass: str = ""
+    message_class: str = ""
     provenance: str = "ours"
     source: str = ""
     action: str | None = None
@@ -332,22 +334,32 @@ class Row:
 
     def encode(self, values: Mapping[str, Value] | None = None) -> bytes:
         """Return the bytes of a row; a missing value becomes the plain one. Limits are not looked at."""
-        given = {**self.example(), **(values or {})}
-        if given.keys() != self.named.keys():
-            raise LookupError(f"{self.name} has no field {', '.join(given.keys() - self.named.keys())}")
+        by_name = {**self.example(), **(values or {})}
+        if by_name.keys() != self.named.keys():
+            raise LookupError(f"{self.name} has no field {', '.join(by_name.keys() - self.named.keys())}")
         data = bytearray(self.size)
         for name, item in self.named.items():
-            item.write(data, item.raw_of(given[name]))
+            item.write(data, item.raw_of(by_name[name]))
         return bytes(data)
 
     def decode(self, data: bytes) -> dict[str, Value]:
-        """Return the physical values by name.
+        """Return the physical values by name, of the fields that the data carry.
 
         Raises ValueError for a wrong length.
         """
-        if len(data) != self.size:
+        if not self.has_length(data):
             raise ValueError(f"{self.name}: {len(data)} bytes, must be {self.size}")
-        return {name: item.physical(item.read(data)) for name, item in self.named.items()}
+        return {item.name: item.physical(item.read(data)) for item in self.carried(data)}
+
+    def has_length(self, data: bytes) -> bool:
+        """Return whether the row may have so many bytes."""
+        return self.min_size <= len(data) <= self.size
+
+    def carried(self, data: bytes) -> Iterator[Field]:
+        """Yield the fields in data that may end early: those that are complete, and raw bytes as far as they go."""
+        for item in self.named.values():
+            if item.offset + item.size <= len(data) or (item.kind == "bytes" and item.offset <= len(data)):
+                yield item
 
     def faults(self, data: bytes) -> Iterator[str]:
         """Yield the values that are outside their limits, and unused bits that are not zero."""

@@ -87,21 +87,21 @@ class SerialLine:
             self._answers_in = list(_formats(unit, "reply"))
         self.envelope = self._answers_in[-1].envelope
         self.streamed = {
-            (row.klass, row.id) for row in unit.telemetry.values() if row.unsolicited is not None
+            (row.message_class, row.id) for row in unit.telemetry.values() if row.unsolicited is not None
         }
         """Class and ID of the rows that may come without a request, though nothing in their messages says so."""
         self._left = 0
         """Number of answers to the oldest request that have not come."""
         self.clear()
 
-    def request_format(self, klass: str) -> tuple[Framing, Envelope]:
+    def request_format(self, message_class: str) -> tuple[Framing, Envelope]:
         """Return framing and envelope of the requests of a class."""
-        return _of_class(self._requests_in, klass)[1:]
+        return _of_class(self._requests_in, message_class)[1:]
 
     def clear(self) -> None:
-        """Forget everything received and asked."""
+        """Forget everything received and pending."""
         self.received = bytearray()
-        self._asked: deque[Request] = deque()
+        self._pending: deque[Request] = deque()
         self._begin()
 
     def numbered(self, request: Request) -> Request:
@@ -111,7 +111,7 @@ class SerialLine:
 
     def encode(self, request: Request) -> bytes:
         """Return a request as bytes on the line."""
-        framing, envelope = self.request_format(request.klass)
+        framing, envelope = self.request_format(request.message_class)
         return framing.encode(envelope.body(request))
 
     def post(self, request: Request, *, answered: bool = True) -> bytes:
@@ -123,17 +123,17 @@ class SerialLine:
             self.expect(request)
         return line
 
-    def telemetry_frame(self, body: bytes, klass: str) -> bytes:
+    def telemetry_frame(self, body: bytes, message_class: str) -> bytes:
         """Return the body of a telemetry answer as bytes on the line."""
-        framing = _of_class(self._answers_in, klass).framing
+        framing = _of_class(self._answers_in, message_class).framing
         if isinstance(framing, Escaped) and self.dialect == "c":
             return framing.encode(body, TELEMETRY)
         return framing.encode(body)
 
     def expect(self, request: Request) -> None:
         """Note a request, in order."""
-        self._asked.append(request)
-        if len(self._asked) == 1:
+        self._pending.append(request)
+        if len(self._pending) == 1:
             self._begin()
 
     def feed(self, data: bytes) -> list[Answer]:
@@ -141,15 +141,15 @@ class SerialLine:
         self.received += data
         answers = []
         while self.received:
-            asked = self._asked[0] if self._asked else None
+            pending = self._pending[0] if self._pending else None
             _, framing, envelope = self._answer_format(self.received[:1])
             echo = (
                 None
-                if asked is None or self._echoed or not self._answers(asked, "echo")
-                else envelope.body(asked)
+                if pending is None or self._echoed or not self._answers(pending, "echo")
+                else envelope.body(pending)
             )
             measure = (
-                partial(envelope.size, asked=asked) if echo is None else partial(_size_of_echo, len(echo))
+                partial(envelope.size, pending=pending) if echo is None else partial(_size_of_echo, len(echo))
             )
             try:
                 taken = framing.take(self.received, measure)
@@ -158,7 +158,7 @@ class SerialLine:
                 self.received.clear()
             if taken is None:
                 break
-            answer = self._answer(envelope, taken, asked, echo)
+            answer = self._answer(envelope, taken, pending, echo)
             if answer is not None:
                 answers.append(answer)
         return answers
@@ -172,45 +172,50 @@ class SerialLine:
         return self._answers_in[-1]
 
     def _answer(
-        self, envelope: Envelope, taken: Taken, asked: Request | None, echo: bytes | None
+        self, envelope: Envelope, taken: Taken, pending: Request | None, echo: bytes | None
     ) -> Answer | None:
         if taken.junk or (echo is not None and taken.body != echo):
             answer = Answer("malformed", data=taken.body)
-        elif asked is not None and echo is not None:
+        elif pending is not None and echo is not None:
             if self._left:
                 self._echoed = True
                 return None
-            answer = Answer("ack", row_id=asked.id, klass=asked.klass)
+            answer = Answer("ack", row_id=pending.id, message_class=pending.message_class)
         else:
-            answer = envelope.answer(taken, asked)
-        awaited = asked is not None and (
-            answer.row_id in (None, asked.id) or self._follows(asked, answer) or answer.kind == "malformed"
+            answer = envelope.answer(taken, pending)
+        awaited = pending is not None and (
+            answer.row_id in (None, pending.id)
+            or self._follows(pending, answer)
+            or answer.kind == "malformed"
         )
-        streamed = (answer.klass, answer.row_id) in self.streamed
+        streamed = (answer.message_class, answer.row_id) in self.streamed
         if (
             streamed
             and not awaited
             and answer.kind == "telemetry"
-            and not envelope.marks_unsolicited(answer.klass)
+            and not envelope.marks_unsolicited(answer.message_class)
         ):
             return replace(answer, kind="unsolicited")
         if awaited and answer.final and answer.kind not in ("unsolicited", "burst"):
             self._left -= 1
             if self._left <= 0 or answer.kind in ("nack", "malformed") or self.envelope.has_final:
-                self._asked.popleft()
+                self._pending.popleft()
                 self._begin()
         return answer
 
     def _begin(self) -> None:
         """Begin to await the answers of the oldest request."""
         self._echoed = False
-        row = self._unit.row(self._asked[0]) if self._asked else None
+        row = self._unit.row(self._pending[0]) if self._pending else None
         answers = () if row is None else self._unit.serial_answers(row)
         self._left = sum(answer != "echo" for answer in answers)
 
-    def _follows(self, asked: Request, answer: Answer) -> bool:
+    def _follows(self, pending: Request, answer: Answer) -> bool:
         """Return whether an answer is another row that answers a request."""
-        row, other = self._unit.row(asked), self._unit.row(Request(answer.row_id or 0, klass=answer.klass))
+        row, other = (
+            self._unit.row(pending),
+            self._unit.row(Request(answer.row_id or 0, message_class=answer.message_class)),
+        )
         return row is not None and other is not None and f"row:{other.name}" in row.answers
 
     def _answers(self, request: Request, kind: str) -> bool:
@@ -222,8 +227,8 @@ def _size_of_echo(size: int, _begun: bytes) -> int:
     return size
 
 
-def _of_class(formats: list[Format], klass: str) -> Format:
-    return next((item for item in formats if klass in item.classes), formats[-1])
+def _of_class(formats: list[Format], message_class: str) -> Format:
+    return next((item for item in formats if message_class in item.classes), formats[-1])
 
 
 def _formats(unit: Unit, direction: str) -> Iterator[Format]:
@@ -246,12 +251,14 @@ def _formats(unit: Unit, direction: str) -> Iterator[Format]:
     yield Format((), framing, Headed(unit, framing, link.check, (), elsewhere))
 
 
-def _has_messages(unit: Unit, klass: str, direction: str) -> bool:
+def _has_messages(unit: Unit, message_class: str, direction: str) -> bool:
     """Return whether there are requests, or answers, of a class; a class without rows has both."""
-    rows = [row for row in unit.rows if row.klass == klass]
+    rows = [row for row in unit.rows if row.message_class == message_class]
     if direction == "request":
         return not rows or any(not row.only_sent for row in rows)
-    models = [item for item in unit.serial.reply_header if item.classes is None or klass in item.classes]
+    models = [
+        item for item in unit.serial.reply_header if item.classes is None or message_class in item.classes
+    ]
     roles = {part.role for item in models for part in (item, *item.bits)}
     refused = not roles.isdisjoint(("status", "ack")) or unit.serial.refusal is not None
     return refused or not rows or any(row.answers or row.is_telemetry for row in rows)
@@ -289,7 +296,7 @@ class Headed:
     ) -> None:
         link, order = unit.serial, unit.conventions.byte_order
         self._unit = unit
-        self._klass = classes[0] if len(classes) == 1 else ""
+        self._message_class = classes[0] if len(classes) == 1 else ""
         self._classes, self._elsewhere = classes, elsewhere
         self._start = framing.start
         self._check = described(check)
@@ -325,12 +332,18 @@ class Headed:
             return self.closed(b"", row.request.encode())
         if (row is not None and row.request) or not self.requests.roles():
             raise ValueError(f"no text requests {request} with {len(request.data)} bytes")
-        values = {"id": request.id, "class": self._codes.get(request.klass, 0), "sequence": request.sequence}
-        return self.closed(self.requests.write(values, request.klass, len(request.data)), request.data)
+        values = {
+            "id": request.id,
+            "class": self._codes.get(request.message_class, 0),
+            "sequence": request.sequence,
+        }
+        return self.closed(
+            self.requests.write(values, request.message_class, len(request.data)), request.data
+        )
 
-    def data_sizes(self, klass: str) -> range:
+    def data_sizes(self, message_class: str) -> range:
         """Return the numbers of bytes of data that requests of a class can have."""
-        return self.requests.data_sizes(klass)
+        return self.requests.data_sizes(message_class)
 
     def closed(self, header: bytes, data: bytes) -> bytes:
         """Return header, data and check."""
@@ -338,40 +351,42 @@ class Headed:
         covered = b"".join(part for name, part in parts.items() if name in self.covers)
         return header + data + self._compute(covered)
 
-    def size(self, begun: bytes, asked: Request | None) -> int | None:
+    def size(self, begun: bytes, pending: Request | None) -> int | None:
         """Return the size of header, data and check."""
-        opened = self.replies.read(begun, self._klass)
+        opened = self.replies.read(begun, self._message_class)
         if opened is None:
             return None
         data = self.replies.data_size(opened)
         if data is None:
-            row = self._unit.row(self._request(opened, asked))
+            row = self._unit.row(self._request(opened, pending))
             data = row.size if row is not None and row.is_telemetry and not _refused(opened) else 0
         return opened.size + data + self.check_size
 
-    def _request(self, opened: Opened, asked: Request | None) -> Request:
+    def _request(self, opened: Opened, pending: Request | None) -> Request:
         """Return the request that an answer names, or the one that was asked if it names none."""
         if "id" not in opened.values:
-            if asked is None or asked.klass in self._elsewhere:
+            if pending is None or pending.message_class in self._elsewhere:
                 raise ValueError("an answer without a request")
-            if self._classes and asked.klass not in self._classes:
+            if self._classes and pending.message_class not in self._classes:
                 raise ValueError("an answer in the format of another class")
-            return asked
-        klass = opened.klass or (asked.klass if asked is not None and asked.id == opened.values["id"] else "")
-        return Request(opened.values["id"], klass=klass)
+            return pending
+        message_class = opened.message_class or (
+            pending.message_class if pending is not None and pending.id == opened.values["id"] else ""
+        )
+        return Request(opened.values["id"], message_class=message_class)
 
-    def answer(self, taken: Taken, asked: Request | None) -> Answer:
+    def answer(self, taken: Taken, pending: Request | None) -> Answer:
         """Return the answer in header, data and check, all of which must be right."""
         end = len(taken.body) - self.check_size
         text = taken.body[: max(end, 0)]
         if not self._classes and self.closed(b"", text) == taken.body:
-            found = self._text_answer(text, asked, taken.body)
+            found = self._text_answer(text, pending, taken.body)
             if found is not None:
                 return found
         malformed = partial(Answer, "malformed", data=taken.body)
         try:
-            opened = self.replies.read(text, self._klass)
-            request = None if opened is None else self._request(opened, asked)
+            opened = self.replies.read(text, self._message_class)
+            request = None if opened is None else self._request(opened, pending)
         except ValueError as error:
             return malformed(fault=str(error))
         if opened is None or request is None:
@@ -387,14 +402,16 @@ class Headed:
         values = opened.values
         asynchronous = values.get("class") in self._unsolicited
         numbered = ("unsolicited" if asynchronous else "reply") in self._numbered
-        named = asked is not None and opened.values.get("id", asked.id) == asked.id
-        if asked is not None and named and not asynchronous and not numbered:
-            sequence = values.get("sequence", asked.sequence)
-            if sequence != asked.sequence:
-                return malformed(fault=f"sequence {sequence}, must be {asked.sequence}")
+        named = pending is not None and opened.values.get("id", pending.id) == pending.id
+        if pending is not None and named and not asynchronous and not numbered:
+            sequence = values.get("sequence", pending.sequence)
+            if sequence != pending.sequence:
+                return malformed(fault=f"sequence {sequence}, must be {pending.sequence}")
         row = self._unit.row(request)
-        klass = request.klass or (row.klass if row is not None else "")
-        telemetry = row.is_telemetry if row is not None else self._unit.is_telemetry(klass, request.id)
+        message_class = request.message_class or (row.message_class if row is not None else "")
+        telemetry = (
+            row.is_telemetry if row is not None else self._unit.is_telemetry(message_class, request.id)
+        )
         if not telemetry and not values and self._unit.serial.acknowledge is not None:
             return Answer("malformed", data=taken.body)  # a text, but not the acknowledge
         kind: AnswerKind = "telemetry" if telemetry else "ack"
@@ -406,15 +423,15 @@ class Headed:
         final = bool(values.get("final", 1))
         code = values.get("status", 0)
         number = values["sequence"] if numbered else None
-        return Answer(kind, code, data, request.id, klass, 0, final, time_s, taken.body, number)
+        return Answer(kind, code, data, request.id, message_class, 0, final, time_s, taken.body, number)
 
-    def _text_answer(self, text: bytes, asked: Request | None, body: bytes) -> Answer | None:
+    def _text_answer(self, text: bytes, pending: Request | None, body: bytes) -> Answer | None:
         """Return an acknowledge or refusal that is a text, exactly as in the definition; None if it is neither."""
         link, words = self._unit.serial, text.decode("latin-1")
-        row_id, klass = (None, "") if asked is None else (asked.id, asked.klass)
+        row_id, message_class = (None, "") if pending is None else (pending.id, pending.message_class)
         if words == link.acknowledge:
-            kind: AnswerKind = "malformed" if asked is None or asked.telemetry else "ack"
-            return Answer(kind, data=text, row_id=row_id, klass=klass, body=body)
+            kind: AnswerKind = "malformed" if pending is None or pending.telemetry else "ack"
+            return Answer(kind, data=text, row_id=row_id, message_class=message_class, body=body)
         if link.refusal is None:
             return None
         before, marked, after = link.refusal.partition(CODE)
@@ -422,17 +439,22 @@ class Headed:
         if words != before + number + after or (marked and not (number.isascii() and number.isdigit())):
             return None
         return Answer(
-            "malformed" if asked is None else "nack", int(number or 0), text, row_id, klass, body=body
+            "malformed" if pending is None else "nack",
+            int(number or 0),
+            text,
+            row_id,
+            message_class,
+            body=body,
         )
 
-    def marks_unsolicited(self, klass: str) -> bool:
+    def marks_unsolicited(self, message_class: str) -> bool:
         """Return whether unsolicited telemetry of a class has another code than an answer."""
-        return klass in self._marked
+        return message_class in self._marked
 
-    def can_refuse(self, klass: str) -> bool:
+    def can_refuse(self, message_class: str) -> bool:
         """Return whether there is a text for refusals, or the header of a class has a status or an acknowledge bit."""
         refusal = self._unit.serial.refusal
-        return refusal is not None or bool(self.replies.roles(klass) & {"status", "ack"})
+        return refusal is not None or bool(self.replies.roles(message_class) & {"status", "ack"})
 
 
 def _refused(opened: Opened) -> bool:
@@ -456,38 +478,38 @@ class Dialect:
         """Return ID and data."""
         return bytes((request.id,)) + request.data
 
-    def data_sizes(self, klass: str) -> range:  # noqa: ARG002 -- of all
+    def data_sizes(self, message_class: str) -> range:  # noqa: ARG002 -- of all
         """Return any number: the end of a message is marked."""
         return range(1 << 16)
 
-    def size(self, begun: bytes, asked: Request | None) -> int | None:  # noqa: ARG002 -- the framing marks the end
+    def size(self, begun: bytes, pending: Request | None) -> int | None:  # noqa: ARG002 -- the framing marks the end
         """Return None: the end of a message is marked."""
         return None
 
-    def can_refuse(self, klass: str) -> bool:  # noqa: ARG002 -- in all
+    def can_refuse(self, message_class: str) -> bool:  # noqa: ARG002 -- in all
         """Return True."""
         return True
 
-    def marks_unsolicited(self, klass: str) -> bool:  # noqa: ARG002 -- in all that have it
+    def marks_unsolicited(self, message_class: str) -> bool:  # noqa: ARG002 -- in all that have it
         """Return True."""
         return True
 
-    def answer(self, taken: Taken, asked: Request | None) -> Answer:
+    def answer(self, taken: Taken, pending: Request | None) -> Answer:
         """Return the answer in a message of the unit's dialect."""
         body = taken.body
-        row = None if asked is None else self._unit.row(asked)
-        as_asked = self._dialect == "b" and row is not None and row.is_telemetry and row.size == len(body)
+        row = None if pending is None else self._unit.row(pending)
+        as_requested = self._dialect == "b" and row is not None and row.is_telemetry and row.size == len(body)
         if (
             taken.start == CUBESPACE[1]
             and body[:1] == bytes((BURST_ID,))
             and len(body) == 1 + BURST_SIZE
-            and not as_asked
+            and not as_requested
         ):
             return Answer("burst", data=body[1:], row_id=BURST_ID, body=body)
         if self._dialect == "b":
-            if asked is None:
+            if pending is None:
                 return Answer("malformed", data=body)
-            return self._generation_1(asked.id, body, body, named=False)
+            return self._generation_1(pending.id, body, body, named=False)
         if not body:
             return Answer("malformed")
         if self._dialect == "a":

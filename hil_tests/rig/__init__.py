@@ -1,1 +1,1 @@
-"""What stands around a unit under test: emulator, links, control channel, bus, folder."""
+"""The surroundings of a unit under test: emulator, links, control channel, bus, folder."""

@@ -84,18 +84,19 @@ def installed_command() -> str:
     beside_python = Path(sys.executable).with_name("starhil")
     if os.access(beside_python, os.X_OK):
         return str(beside_python)
-    found = shutil.which("starhil")
-    if found is None:
+    command = shutil.which("starhil")
+    if command is None:
         raise EmulatorProcessError(
             f"the command starhil is neither beside {sys.executable} nor on PATH; install it with pip install starhil"
         )
-    return found
+    return command
 
 
 def _starhil_command() -> list[str]:
     """Return the beginning of a command line for a `starhil` that ends with this process."""
     return [
         sys.executable,
+        "-P",
         "-m",
         "starhil.hil_tests.rig.end_with_parent",
         str(os.getpid()),

@@ -1,4 +1,4 @@
-"""Session scripts: read, checked, run, reported."""
+"""Session scripts: reading, validation, execution and reports."""
 
 from starhil.hil_tests.session.session_run import SessionRequest, run_session
 

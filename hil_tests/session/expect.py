@@ -1,10 +1,11 @@
-"""Expectations of a session script: conditions on fields, and limits of the attitude error."""
+"""Expectations of a session script: conditions on the fields of a row, and limits of the attitude error."""
 
 from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Self
 
@@ -29,9 +30,11 @@ from starhil.hil_tests.attitude import (
     unit,
 )
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.errors import did_you_mean
+from starhil.protocol.errors import did_you_mean, remedy
+from starhil.protocol.icd.codec import Field as RowField
+from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.conventions import Conventions
-from starhil.protocol.icd.values import Value
+from starhil.protocol.icd.values import FLAGS, Value
 
 RELATIVE_ROUNDING: Final = 1e-6
 """Numbers without a tolerance may differ by the rounding of a 32-bit float."""
@@ -165,15 +168,15 @@ class Conditions(Keys):
                 if value == expected and isinstance(value, bool) == isinstance(expected, bool)
                 else show(expected)
             )
-        wanted = float(expected) + self.plus
-        tolerance = RELATIVE_ROUNDING * abs(wanted) if self.within is None else self.within
+        target = float(expected) + self.plus
+        tolerance = RELATIVE_ROUNDING * abs(target) if self.within is None else self.within
         if isinstance(value, int) and self.within is None:
             tolerance = 0.0
         angle = self.angle_deg is not None
-        distance = abs(math.remainder(float(value) - wanted, 360.0)) if angle else abs(float(value) - wanted)
+        distance = abs(math.remainder(float(value) - target, 360.0)) if angle else abs(float(value) - target)
         if distance <= tolerance:
             return None
-        text = show(wanted if self.plus else expected)
+        text = show(target if self.plus else expected)
         return text if self.within is None else f"{text} ± {self.within:g} (off by {distance:.6g})"
 
 
@@ -243,14 +246,14 @@ class AttitudeCheck(StatedAttitude):
         except BenchError as refusal:
             return None, str(refusal)
         error = attitude_error(measured, truth)
-        for word, limit, found in (
+        for word, limit, arcsec in (
             ("cross-boresight", self.within_arcsec, error.cross_boresight_arcsec),
             ("roll", self.roll_within_arcsec, error.roll_arcsec),
             ("total", self.total_within_arcsec, error.total_arcsec),
         ):
-            if limit is not None and not found <= limit:
-                problem = f"{word} error {show_angle(found)}, expected at most {limit:g} arcsec"
-                if found > LARGE_ARCSEC:
+            if limit is not None and not arcsec <= limit:
+                problem = f"{word} error {show_angle(arcsec)}, expected at most {limit:g} arcsec"
+                if arcsec > LARGE_ARCSEC:
                     problem += f"; measured {describe(measured)}, true {describe(truth)}"
                 return error, problem
         return error, None
@@ -278,3 +281,56 @@ def measured_attitude(values: Mapping[str, Value]) -> Quaternion:
     if "q_w" in values:
         return unit([*parts, float(values["q_w"])])
     return from_vector_part(*parts)
+
+
+def unknown_fields(key: str, row: Row, names: Iterable[str]) -> Iterator[str]:
+    """Yield an error for each name under a key that is no field of a row."""
+    known = row.named_fields
+    for name in names:
+        if name not in known:
+            yield f"{key}: row '{row.name}' has no field '{name}'{remedy(name, known)}"
+
+
+def impossible(item: RowField, conditions: Conditions) -> Iterator[str]:
+    """Yield why conditions can never hold, and convert their values in place to those of the field."""
+    if item.kind == "bytes":
+        numeric = {"min", "max", "above", "within", "plus", "angle_deg"}
+        keys = {Conditions.model_fields[name].alias or name for name in conditions.model_fields_set}
+        for key in sorted(numeric & keys):
+            yield f"'{item.name}' is bytes, and '{key}' is for numbers; give value, one_of or not"
+    problems: list[str] = []
+
+    def convert(value: Operand) -> Operand:
+        try:
+            return value if isinstance(value, Variable) else _expected(item, value)
+        except ValueError as error:
+            problems.append(f"'{item.name}' is {error}")
+            return value
+
+    for key in ("value", "angle_deg", "differs_from"):
+        if (value := getattr(conditions, key)) is not None:
+            setattr(conditions, key, convert(value))
+    conditions.one_of = [convert(value) for value in conditions.one_of]
+    yield from problems
+
+
+def _expected(item: RowField, value: Value) -> Value:
+    """Return a value of a script as the field has it: bytes for hexadecimal text, true for the name `true` of a flag."""
+    if item.kind == "bytes":
+        with suppress(ValueError):
+            if isinstance(value, str) and len(data := bytes.fromhex(value)) == item.size:
+                return data
+        raise ValueError(f"{item.size} bytes in hexadecimal, not {show(value)!r}")
+    if item.is_flag:
+        value = FLAGS.get(value, value) if item.enum is not None and isinstance(value, str) else value
+        if not isinstance(value, bool):
+            raise ValueError(f"true or false, not {value!r}")
+    elif item.enum is not None:
+        if value not in item.enum.values and type(value) is not int:
+            hint = did_you_mean(show(value), item.enum.values) or f"; one of: {', '.join(item.enum.values)}"
+            raise ValueError(f"never '{show(value)}'{hint}")
+    elif isinstance(value, bool):
+        raise ValueError(f"not true or false, not {value!r}")
+    elif item.kind != "text" and isinstance(value, str):
+        raise ValueError(f"a number, not {value!r}")
+    return value

@@ -13,7 +13,9 @@ from pydantic import ConfigDict, Field, ValidationError, model_validator
 
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.session.expect import Keys, StatedAttitude
-from starhil.hil_tests.session.steps import ACTIONS, FileName, Link, Step, Texts, Timeout
+from starhil.hil_tests.session.step import Step
+from starhil.hil_tests.session.step_keys import FileName, Link, Texts, Timeout
+from starhil.hil_tests.session.steps import ACTIONS
 from starhil.protocol.errors import MAX_PROBLEMS, did_you_mean
 from starhil.protocol.files.user_file import TomlError, read_user_toml
 from starhil.protocol.files.validation import problems
@@ -111,7 +113,6 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
 
 
 def _step(where: str, table: dict[str, Any], context: dict[str, Any]) -> tuple[Step | None, list[str]]:
-    """Check a step; return it, or its problems."""
     present = [key for key in ACTIONS if key in table]
     if len(present) == 1:
         return _checked(ACTIONS[present[0]], table, where, context)
@@ -132,13 +133,13 @@ def _checked(
     try:
         return model.model_validate(table, context={**(context or {}), "broken": frozenset()}), []
     except ValidationError as error:
-        found = list(problems(error, model))
-    broken = {problem.location[0] for problem in found if problem.location}
+        found_problems = list(problems(error, model))
+    broken = {problem.location[0] for problem in found_problems if problem.location}
     if broken:
         rest = {key: value for key, value in table.items() if key not in broken}
         try:
             model.model_validate(rest, context={**(context or {}), "broken": broken})
         except ValidationError as error:
-            found += [problem for problem in problems(error, model) if not problem.location]
-    texts = (str(problem) if problem.key else problem.text for problem in found)
+            found_problems += [problem for problem in problems(error, model) if not problem.location]
+    texts = (str(problem) if problem.key else problem.text for problem in found_problems)
     return None, list(dict.fromkeys(f"{where}: {text}" for text in texts))

@@ -6,14 +6,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from starhil.hil_tests.attitude import Quaternion
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.reports import FAILED, PASSED, SKIPPED
 from starhil.hil_tests.rig.interruption import Interrupted
-from starhil.hil_tests.rig.rig import Rig
+from starhil.hil_tests.rig.rig import ControlledTruth, Rig
 from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.results import SessionResult, StepResult
 from starhil.hil_tests.session.script import Script
-from starhil.hil_tests.session.steps import Attempt, SessionState, Step
+from starhil.hil_tests.session.step import Attempt, SessionState, Step, TruthOverTime
 from starhil.protocol.errors import ProtocolError
 
 
@@ -30,9 +31,13 @@ def run_steps(
     `folder` gets CSV and image files; `truth_path` is a file of true attitudes instead of the script's truth. A signal,
     whether during a step or while a result is shown, ends the run; the results of earlier steps are kept.
     """
-    if truth_path is None and script.truth.file is not None:
-        truth_path = folder / script.truth.file
-    truth = script.truth.attitude if truth_path is None else TruthLogReader(truth_path)
+    truth: Quaternion | TruthOverTime | None = script.truth.attitude
+    if truth_path is not None:
+        truth = TruthLogReader(truth_path)
+    elif rig.has_control_of_another:
+        truth = ControlledTruth(rig)
+    elif script.truth.file is not None:
+        truth = TruthLogReader(folder / script.truth.file)
     session = SessionState(rig, folder, truth)
     begin = time.monotonic()
     planned = script.planned(rig.links)

@@ -60,11 +60,11 @@ async def _send_traffic_until_stopped(spec: str, rate: float, pipe: Connection) 
     can_id = CanId(MessageType.TELEMETRY, ECHO_ROW, TALKER, LISTENER).pack()
     ping = CanId(MessageType.TELEMETRY_REQUEST, ECHO_ROW, HOST, ECHO).pack()
     pong = CanId(MessageType.TELEMETRY, ECHO_ROW, ECHO, HOST).pack()
-    seen: list[int] = []
+    numbers: list[int] = []
 
     def count(frame: CanFrame) -> None:
         if frame.id == can_id:
-            seen.append(int.from_bytes(frame.data, "little"))
+            numbers.append(int.from_bytes(frame.data, "little"))
         elif frame.id == ping:
             listener.send(CanFrame(pong, frame.data))
 
@@ -84,10 +84,10 @@ async def _send_traffic_until_stopped(spec: str, rate: float, pipe: Connection) 
     seconds = time.monotonic() - begin
     await talker.drain()
     end = time.monotonic() + SETTLE_S
-    while len(seen) < sent - refused and time.monotonic() < end:
+    while len(numbers) < sent - refused and time.monotonic() < end:
         await asyncio.sleep(TICK_S)
-    disordered = sum(later <= earlier for earlier, later in pairwise(seen))
-    pipe.send((seconds, sent, sent - len(set(seen)), disordered, refused))
+    disordered = sum(later <= earlier for earlier, later in pairwise(numbers))
+    pipe.send((seconds, sent, sent - len(set(numbers)), disordered, refused))
     await talker.close()
     await listener.close()
 

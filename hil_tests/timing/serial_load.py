@@ -45,7 +45,6 @@ class _SerialPipeline:
         self.exchanges = 0
         self.wrong = 0
         self.last = b""
-        """Data of the last reply."""
 
     @property
     def under_way(self) -> int:

@@ -26,6 +26,7 @@ from starhil.protocol.messages import (
     DEFAULT_MAX_SIZE,
     DEFAULT_TIMEOUT_S,
     FaultKind,
+    Flaw,
     LinkFault,
     Receiver,
     Reply,
@@ -56,9 +57,7 @@ class MessageType(IntEnum):
     TELEMETRY = 5
     TELEMETRY_NACK = 6
     TELECOMMAND_EXTENDED = 7
-    """A segment of a telecommand."""
     TELEMETRY_EXTENDED = 8
-    """A segment of a telemetry reply."""
     EVENT = 9
     UNSOLICITED_FIRST = 10
     UNSOLICITED_BODY = 11
@@ -173,6 +172,8 @@ def encode_reply_frames(reply: Reply, source: int) -> list[CanFrame]:
             )
         first, middle, last = segments
         kinds = [first, *[middle] * (len(payloads) - 2), last]
+        if Flaw.SEQUENCE in reply.flaw:
+            payloads[-1] = payloads[-1][:-1] + bytes((payloads[-1][-1] + 1,))
     return [
         CanFrame(CanId(kind, reply.id, source, reply.destination).pack(), payload)
         for kind, payload in zip(kinds, payloads, strict=True)
@@ -184,9 +185,7 @@ class _Assembly:
     """A segmented message that is incomplete."""
 
     first: int
-    """Counter of the first segment."""
     left: int
-    """Remaining segments."""
     time: float
     """Time at which the last segment arrived, s."""
     data: bytearray

@@ -25,7 +25,7 @@ EXTENDED: Final = 1 << 29
 """29-bit CAN ID; this slave uses 11-bit CAN IDs only."""
 ID_MASK: Final = 0x1FFFFFFF
 
-RESTRICTED: Final = (
+RESTRICTED_IDS: Final = (
     (0x000, 0x07F),
     (0x101, 0x180),
     (0x581, 0x5FF),
@@ -45,7 +45,7 @@ def check_can_id(cob_id: int) -> None:
     can_id = cob_id & ID_MASK
     if cob_id & EXTENDED or can_id > 0x7FF:
         raise SdoAbortError(AbortCode.VALUE_RANGE, f"COB-ID 0x{cob_id:08X} has no 11-bit CAN ID")
-    if any(first <= can_id <= last for first, last in RESTRICTED):
+    if any(first <= can_id <= last for first, last in RESTRICTED_IDS):
         raise SdoAbortError(AbortCode.VALUE_RANGE, f"CAN ID 0x{can_id:03X} is restricted")
 
 

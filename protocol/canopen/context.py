@@ -8,7 +8,7 @@ from enum import IntEnum, StrEnum
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.dictionary import Dictionary
 
-UNCONFIGURED: int = 0xFF
+UNCONFIGURED_NODE: int = 0xFF
 """Node ID of a node without one, which LSS must assign."""
 
 

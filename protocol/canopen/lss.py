@@ -7,7 +7,7 @@ from enum import IntEnum
 from typing import Final
 
 from starhil.protocol.canopen.cob import LSS_SLAVE
-from starhil.protocol.canopen.context import UNCONFIGURED, Context, EventKind
+from starhil.protocol.canopen.context import UNCONFIGURED_NODE, Context, EventKind
 from starhil.protocol.canopen.storage import StorageError
 from starhil.protocol.canopen.store_restore import StoreRestore
 
@@ -141,7 +141,7 @@ class LssSlave:
 
     @property
     def _unconfigured(self) -> bool:
-        return self._context.node_id == UNCONFIGURED and self.pending_node_id == UNCONFIGURED
+        return self._context.node_id == UNCONFIGURED_NODE and self.pending_node_id == UNCONFIGURED_NODE
 
     def _identity(self, number: int) -> int:
         """Return the vendor-ID, product code, revision number or serial number for 0 to 3."""
@@ -153,7 +153,11 @@ class LssSlave:
     def _switch_global(self, mode: int) -> None:
         if mode in (0, 1):
             self.configuring = mode == 1
-        if mode == 0 and self._context.node_id == UNCONFIGURED and self.pending_node_id != UNCONFIGURED:
+        if (
+            mode == 0
+            and self._context.node_id == UNCONFIGURED_NODE
+            and self.pending_node_id != UNCONFIGURED_NODE
+        ):
             self._on_node_id(self.pending_node_id)
 
     def _all_match(self, frames: range, step: int, *, matches: bool) -> bool:
@@ -189,7 +193,7 @@ class LssSlave:
         elif command == Command.INQUIRE_NODE_ID:
             self._send(command, bytes([self._context.node_id]))
         elif command == Command.CONFIGURE_NODE_ID:
-            valid = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED
+            valid = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED_NODE
             if valid:
                 self.pending_node_id = data[1]
                 self._context.report(

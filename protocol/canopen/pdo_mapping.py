@@ -102,7 +102,6 @@ class Pdo:
         self._context = context
         self.number = number
         self.indices = communication, mapping = self.direction + number, self.direction.mapping(number)
-        """Indices of its records."""
         self._objects: list[MappedObject] = []
         find = context.dictionary.find
         self._cob_id, self._type, self._event_timer = (find(communication, item) for item in (1, 2, 5))

@@ -39,6 +39,7 @@ class Transfer:
         """The client writes up to 4 bytes with its request, or more in segments of up to 7 bytes, each confirmed."""
         command = data[0]
         answer = bytes([0x60]) + data[1:4] + bytes(4)
+        # bit e: expedited, the data are in the request; bit s: their size is indicated, otherwise it is that of the entry
         if command & 0x02:
             entry = self._dictionary.writable(self.index, self.subindex)
             length = 4 - (command >> 2 & 0x03) if command & 0x01 else min(4, entry.size or 4)
@@ -101,12 +102,14 @@ class Transfer:
             if expected:
                 good = number
                 buffer.data += data[1:]
+                # how much of the last segment is padding is known only at the end
                 if len(buffer.data) > buffer.maximum + SEGMENT:
                     buffer.check()
             answers = []
             if last or number == MAXIMUM_BLOCK:
                 answers = [bytes([0xA2, good, MAXIMUM_BLOCK]) + bytes(5)]
                 good = 0
+                # after a gap, the client sends the last segment again in the next block
                 self.streaming = not (last and expected)
         data = yield answers
         command = _command(data, data[0] >> 5 == 6 and data[0] & 0x01 == 1)
@@ -123,12 +126,14 @@ class Transfer:
         """The client reads blocks of up to 127 segments, confirms each block, and may request segments again."""
         value = self._dictionary.read(self.index, self.subindex)
         block_size, threshold = _valid_block_size(data[4]), data[5]
+        # protocol switch: the client prefers a plain upload for a short value
         if threshold and len(value) <= threshold:
             return (yield from self.upload(data))
         check = crc_hqx(value, 0) if data[0] & 0x04 else 0
         data = yield [bytes([0xC6]) + data[1:4] + len(value).to_bytes(4, "little")]
         _command(data, data[0] >> 5 == 5 and data[0] & 0x03 == 3)
         position = good = 0
+        # an empty value is sent as one segment too, which the client must confirm
         while position < len(value) or good == 0:
             segments = _block(value, position, block_size)
             data = yield segments

@@ -13,7 +13,7 @@ from typing import Final
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import SdoAbortError
 from starhil.protocol.canopen.cob import ERROR_CONTROL, LSS_MASTER, NMT, SDO_RECEIVE
-from starhil.protocol.canopen.context import UNCONFIGURED, Context, EventKind, NmtState, SlaveEvent
+from starhil.protocol.canopen.context import UNCONFIGURED_NODE, Context, EventKind, NmtState, SlaveEvent
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.canopen.emergency import EmergencyProducer
@@ -75,7 +75,7 @@ class CanopenSlave:
         on_restore: ApplicationStore | None = None,
         on_reset: Callable[[], int | None] | None = None,
     ) -> None:
-        if not 1 <= node_id <= 127 and node_id != UNCONFIGURED:
+        if not 1 <= node_id <= 127 and node_id != UNCONFIGURED_NODE:
             raise ProtocolError(f"CANopen node ID {node_id}: must be 1 to 127, or 255 to wait for LSS")
         self.dictionary = dictionary
         self._context = context = Context(dictionary, node_id)
@@ -224,7 +224,7 @@ class CanopenSlave:
     def _route(self) -> None:
         """Assign a handler of data to each CAN ID; all services except LSS need a node ID."""
         self._routes = {LSS_MASTER: [self.lss.receive]}
-        if self.node_id == UNCONFIGURED:
+        if self.node_id == UNCONFIGURED_NODE:
             return
         handlers: list[tuple[int | None, Handler]] = [
             (NMT, self._on_nmt),
@@ -294,7 +294,7 @@ class CanopenSlave:
         self.emergency.reset(application=application)
         self.store.load()
         self._configure()
-        if context.node_id == UNCONFIGURED:
+        if context.node_id == UNCONFIGURED_NODE:
             return
         context.send(ERROR_CONTROL + context.node_id, b"\0")
         context.state = NmtState.PRE_OPERATIONAL

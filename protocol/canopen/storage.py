@@ -21,7 +21,6 @@ class StorageError(ProtocolError):
 
 
 Groups = dict[str, dict[str, bytes]]
-"""Values by name, by group."""
 
 
 class ParameterStorage:

@@ -9,7 +9,7 @@ from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_change
 from starhil.protocol.canopen.context import Context, EventKind
 
 COB_ID: Final = (0x1012, 0)
-CONSUMES: Final = 1 << 31
+CONSUMER_BIT: Final = 1 << 31
 EPOCH_UNIX_S: Final = 441_763_200
 """1984-01-01T00:00:00 UTC, day 0 of TIME_OF_DAY, in Unix time."""
 DAY_S: Final = 86_400
@@ -38,7 +38,7 @@ class TimeConsumer:
     def can_id(self) -> int | None:
         """CAN ID of the TIME message, None while it is not consumed."""
         value = self._cob_id.number()
-        return value & ID_MASK if value & CONSUMES else None
+        return value & ID_MASK if value & CONSUMER_BIT else None
 
     def receive(self, data: bytes) -> None:
         """Process a TIME message; ignore one that is not a valid time of day."""
@@ -50,4 +50,4 @@ class TimeConsumer:
         old, new = self._cob_id.number(), int.from_bytes(data, "little")
         if new & BIT_30:
             raise SdoAbortError(AbortCode.VALUE_RANGE, "this node does not produce TIME messages")
-        check_change(old, new, enabled=lambda value: bool(value & CONSUMES), always=True)
+        check_change(old, new, enabled=lambda value: bool(value & CONSUMER_BIT), always=True)

@@ -42,8 +42,6 @@ class _Signal(NamedTuple):
 
 
 class _Message(NamedTuple):
-    """One message of the database."""
-
     can_id: int
     """With the flag `EXTENDED`."""
     name: str
@@ -78,17 +76,17 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
     telemetry = row.kind == "telemetry"
     request = REQUEST_TYPES[row.kind][long]
     reply = REPLY_TYPES[ReplyKind.TELEMETRY if telemetry else ReplyKind.ACK][long and telemetry]
-    asked, answered = _id(request, *to_device), _id(reply, *to_host)
+    request_id, reply_id = _id(request, *to_device), _id(reply, *to_host)
     if row.only_sent:
         sent = MessageType.UNSOLICITED_FIRST if long else MessageType.UNSOLICITED_LAST
         yield _Message(_id(sent, *to_host), f"TLM_{row.name}", row.size, "SENSOR", fields, row.doc)
         return
     if telemetry:
-        yield _Message(asked, f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}")
-        yield _Message(answered, f"TLM_{row.name}", row.size, "SENSOR", fields, row.doc)
+        yield _Message(request_id, f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}")
+        yield _Message(reply_id, f"TLM_{row.name}", row.size, "SENSOR", fields, row.doc)
     else:
-        yield _Message(asked, f"TC_{row.name}", row.size, "OBC", fields, row.doc)
-        yield _Message(answered, f"ACK_{row.name}", 0, "SENSOR", (), f"Acknowledge of {row.name}.")
+        yield _Message(request_id, f"TC_{row.name}", row.size, "OBC", fields, row.doc)
+        yield _Message(reply_id, f"ACK_{row.name}", 0, "SENSOR", (), f"Acknowledge of {row.name}.")
     refused = _id(nack_type(row.id), *to_host)
     yield _Message(refused, f"NACK_{row.name}", 1, "SENSOR", code, f"Refusal of {row.name}.")
 

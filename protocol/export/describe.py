@@ -59,13 +59,13 @@ def number(value: float) -> str:
 
 def title(row: Row) -> str:
     """Return the heading of a row: its class, if it has one, ID and name."""
-    klass = f"{row.klass} " if row.klass else ""
-    return f"{klass}{row.id} (0x{row.id:02X}) {row.name}"
+    message_class = f"{row.message_class} " if row.message_class else ""
+    return f"{message_class}{row.id} (0x{row.id:02X}) {row.name}"
 
 
 def anchor(row: Row) -> str:
     """Return the anchor of a row in a page; it is unique."""
-    return f"row-{row.kind}-{row.klass}-{row.id}"
+    return f"row-{row.kind}-{row.message_class}-{row.id}"
 
 
 def facts(row: Row) -> str:

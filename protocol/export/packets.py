@@ -43,24 +43,24 @@ def check_one_format(stack: SerialStack, target: str) -> None:
             raise IcdError(f"link.serial: {what} cannot be exported to {target}")
 
 
-def row_key(classes: Mapping[str, MessageClass], klass: str, row_id: int) -> int:
+def row_key(classes: Mapping[str, MessageClass], message_class: str, row_id: int) -> int:
     """Return the key of a row.
 
     Raises IcdError for an ID that leaves no room for a class.
     """
-    code = classes[klass].code if klass else None
+    code = classes[message_class].code if message_class else None
     if code is None:
         return row_id
     if row_id >= 1 << CLASS_SHIFT:
         raise IcdError(
-            f"class {klass}: ID {row_id} is above {(1 << CLASS_SHIFT) - 1}; an export cannot hold it beside a class"
+            f"class {message_class}: ID {row_id} is above {(1 << CLASS_SHIFT) - 1}; an export cannot hold it beside a class"
         )
     return code << CLASS_SHIFT | row_id
 
 
 def key_of(icd: InterfaceDefinition, row: Row) -> int:
     """Return the key of a row of a definition."""
-    return row_key(icd.classes_by_name, row.klass, row.id)
+    return row_key(icd.classes_by_name, row.message_class, row.id)
 
 
 def key_bits(icd: InterfaceDefinition) -> int:

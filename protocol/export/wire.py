@@ -50,21 +50,21 @@ def _section(name: str, rows: Iterable[tuple[str, ...]], **values: object) -> Se
 
 def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
     """Return the sections about conventions, classes, error codes and links of the unit."""
-    found = [_conventions(icd)]
+    parts = [_conventions(icd)]
     if icd.classes:
-        found.append(_classes(icd))
+        parts.append(_classes(icd))
     if _has_error_codes(icd):
-        found.append(_errors(icd))
+        parts.append(_errors(icd))
     if icd.link.serial is not None:
         if isinstance(icd.link.serial.framing, CubeSpaceFraming):
-            found.append(_cubespace(icd, icd.link.serial.framing))
+            parts.append(_cubespace(icd, icd.link.serial.framing))
         else:
-            found.append(_composed(icd, icd.link.serial))
+            parts.append(_composed(icd, icd.link.serial))
     if icd.link.can is not None:
-        found.append(_can())
+        parts.append(_can())
     if icd.canopen is not None:
-        found += [_objects(icd.canopen), _pdos(icd.canopen)]
-    return tuple(found)
+        parts += [_objects(icd.canopen), _pdos(icd.canopen)]
+    return tuple(parts)
 
 
 def _conventions(icd: InterfaceDefinition) -> Section:

@@ -1,1 +1,1 @@
-"""Files that users name: found, read within limits, validated, replaced safely."""
+"""User files: lookup by name, bounded reading, validation, and safe replacement."""

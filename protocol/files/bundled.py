@@ -13,7 +13,6 @@ CONFIGS: Final = Path(__file__).resolve().parents[2] / "configs"
 """Folder `configs` of the installation or checkout."""
 
 UNITS_FOLDER: Final = CONFIGS / "units"
-"""Folder of the bundled units."""
 
 DEFAULT_UNIT: Final = "cubestar"
 """Name of the unit that is emulated unless another is chosen."""

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, partial
 from itertools import repeat
 from typing import Any, Final, Literal, NamedTuple, get_args, get_origin
 
-from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import BaseModel, GetCoreSchemaHandler, ValidationError
+from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from starhil.protocol.errors import MAX_PROBLEMS, did_you_mean, remedy
 
-_NEEDED: Final = {
+_REQUIREMENTS: Final = {
     "float_type": "a number",
     "finite_number": "a finite number",
     "int_type": "a whole number",
@@ -39,8 +40,23 @@ _LIMITS: Final = {
 _UNIONS: Final = ("union_tag_invalid", "union_tag_not_found")
 """Types of errors in the key that selects the model of a table."""
 
-_ABSENT: Final = {"missing", *_UNIONS}
+_ERRORS_OF_ABSENT_KEYS: Final = {"missing", *_UNIONS}
 """Types of errors in a key that the document may lack."""
+
+
+@dataclass(frozen=True)
+class TableOf:
+    """Annotation of a dictionary: the keys given in a table, which is valid for a model."""
+
+    model: type[BaseModel]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Validate by the model."""
+        return core_schema.no_info_after_validator_function(
+            lambda table: table.model_dump(exclude_unset=True),
+            handler.generate_schema(self.model),
+            serialization=core_schema.plain_serializer_function_ser_schema(dict),
+        )
 
 
 class Problem(NamedTuple):
@@ -83,7 +99,7 @@ def problems(
         Number of errors that are examined, at least `MAX_PROBLEMS`; for each further one there is an empty problem.
         Default: all.
     """
-    found: dict[tuple[int | str, ...], tuple[ErrorDetails, Callable[[bool], list[str]]]] = {}
+    reports: dict[tuple[int | str, ...], tuple[ErrorDetails, Callable[[bool], list[str]]]] = {}
     above: set[tuple[int | str, ...]] = set()
     items = error.errors(include_url=False)
     for item in items[:most]:
@@ -99,12 +115,12 @@ def problems(
             location = (*location, str(item["ctx"]["discriminator"]).strip("'"))
             say = partial(_choice, item, models)
         if document is not None:
-            location = _in(document, location, absent=item["type"] in _ABSENT)
-        found.setdefault(location, (item, say))  # an alternative of a union may have been reported
+            location = _in(document, location, absent=item["type"] in _ERRORS_OF_ABSENT_KEYS)
+        reports.setdefault(location, (item, say))  # an alternative of a union may have been reported
         above.update(location[:count] for count in range(len(location)))
     written = 0
-    for location, (item, say) in found.items():
-        if item["type"] in _NEEDED and location in above:
+    for location, (item, say) in reports.items():
+        if item["type"] in _REQUIREMENTS and location in above:
             continue  # another alternative has the right type, and errors in it
         key = _dotted(document, location)
         for text in say(written < MAX_PROBLEMS):
@@ -133,7 +149,7 @@ def _texts(item: ErrorDetails, suggest: bool) -> list[str]:
 
 def wording(item: ErrorDetails, *, suggest: bool = True) -> str:
     """Return the problem and what is needed instead, such as `must be at least 1 (given: 0)`."""
-    kind, context, given = item["type"], item.get("ctx", {}), item["input"]
+    kind, context, value = item["type"], item.get("ctx", {}), item["input"]
     if kind == "missing":
         return "missing"
     if kind in _LIMITS:
@@ -141,22 +157,22 @@ def wording(item: ErrorDetails, *, suggest: bool = True) -> str:
         text = f"must be {words} {context[key]:g}"
     elif kind == "literal_error":
         allowed = context["expected"].replace(" or ", ", ")
-        names = re.findall("'([^']*)'", allowed) if suggest and isinstance(given, str) else ()
-        return f"must be one of {allowed} (given: {given!r}){did_you_mean(str(given), names)}"
+        names = re.findall("'([^']*)'", allowed) if suggest and isinstance(value, str) else ()
+        return f"must be one of {allowed} (given: {value!r}){did_you_mean(str(value), names)}"
     elif kind in ("too_short", "too_long"):
         words, limit = ("at least", "min_length") if kind == "too_short" else ("at most", "max_length")
         number = context["actual_length"]
         return f"must have {words} {context[limit]} items" + ("" if number is None else f", not {number}")
-    elif kind in _NEEDED:
-        text = f"must be {_NEEDED[kind]}"
+    elif kind in _REQUIREMENTS:
+        text = f"must be {_REQUIREMENTS[kind]}"
     else:
         message = item["msg"].removeprefix("Value error, ")
         text = f"{message[:1].lower()}{message[1:]}"
-    quoted = isinstance(given, str) and repr(given) in text
+    quoted = isinstance(value, str) and repr(value) in text
     return (
         text
-        if quoted or isinstance(given, (dict, list)) or kind == "json_invalid"
-        else f"{text} (given: {given!r})"
+        if quoted or isinstance(value, (dict, list)) or kind == "json_invalid"
+        else f"{text} (given: {value!r})"
     )
 
 
@@ -223,8 +239,6 @@ def _dotted(document: Any, location: Sequence[int | str]) -> str:
 
 
 class _Key(NamedTuple):
-    """The value of a key of a table."""
-
     annotation: Any
     models: list[type[BaseModel]]
     """Models of the tables in it."""
@@ -234,12 +248,14 @@ class _Key(NamedTuple):
 
 @cache
 def _keys_of(model: type[BaseModel]) -> dict[str, _Key]:
-    """Return the keys of a table."""
-    annotations = {field.alias or name: field.annotation for name, field in model.model_fields.items()}
-    return {
-        key: _Key(annotation, _models_in(annotation), get_origin(annotation) is dict)
-        for key, annotation in annotations.items()
-    }
+    keys = {}
+    for name, field in model.model_fields.items():
+        models = [below for item in (field.annotation, *field.metadata) for below in _models_in(item)]
+        is_mapping = get_origin(field.annotation) is dict and not any(
+            isinstance(item, TableOf) for item in field.metadata
+        )
+        keys[field.alias or name] = _Key(field.annotation, models, is_mapping)
+    return keys
 
 
 @cache
@@ -253,6 +269,8 @@ def _tags_of(model: type[BaseModel]) -> tuple[object, ...]:
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
     """Return all models in an annotation, at any depth."""
+    if isinstance(annotation, TableOf):
+        return [annotation.model]
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for inner in get_args(annotation) for model in _models_in(inner)]

@@ -1,10 +1,10 @@
 """Codec of the rows of an interface definition: physical values to wire bytes and back.
 
-A `Field` is the keys of its definition (`icd_schema.FieldKeys`) with its place in the bytes of a row; it converts
+A `Field` is the keys of its definition (`schema.FieldKeys`) with its place in the bytes of a row; it converts
 between raw and physical values, checks limits, and names row and field in its errors. A `Row` is compiled at its
-first use: one `struct.Struct` for each run of slots of one byte order, and shifts for bits. Built of construct, the
-same rows take 2.1 to 5.0 times as long (the 39 fields of `star_tracker`: 68 against 146 µs to encode, 23 against 89
-µs to decode; the 3 of `quaternion`: 8 against 19 and 2.6 against 12.9), and as many lines.
+first use: one `struct.Struct` for each run of slots of one byte order, and shifts for bits. The same
+rows built on construct took 2.1 to 5.0 times as long (`star_tracker` with 39 fields: 146 instead of 68 µs to encode, 89
+instead of 23 µs to decode; `quaternion` with 3: 19 instead of 8 µs, 12.9 instead of 2.6 µs), and as many lines of code.
 """
 
 from __future__ import annotations
@@ -368,7 +368,7 @@ class Row(RowKeys):
     fields: tuple[Field, ...]
     """All fields in wire order, unused ones included."""
     slots: tuple[Slot, ...]
-    klass: str = ""
+    message_class: str = ""
     """Name of the row's class, if the unit has classes."""
     answers: tuple[str, ...] = ("reply",)
     """Answers in order: `echo`, `reply`, `row:NAME`."""
@@ -431,14 +431,14 @@ class Row(RowKeys):
 
         Raises FieldError: a value is invalid; the text names row.field, the value and the allowed values.
         """
-        given = {} if values is None else values
-        unknown = given.keys() - self.named_fields.keys()
+        by_name = {} if values is None else values
+        unknown = by_name.keys() - self.named_fields.keys()
         if unknown:
             name = min(unknown)
             raise FieldError(f"{self.name}.{name}: no such field{remedy(name, self.named_fields)}")
         raw: list[Any] = [b"" if slot.type == "bytes" else 0 for slot in self.slots]
         for index, (name, item) in enumerate(self.named_fields.items()):
-            value = given.get(name)
+            value = by_name.get(name)
             if value is None:
                 if self.kind == "telecommand" and item.required:
                     raise FieldError(f"{self.name}.{name}: missing value", index=index)
@@ -464,7 +464,7 @@ class Row(RowKeys):
         if not self.min_size <= len(data) <= self.size:
             wanted = f"{self.min_size} to {self.size}" if self.min_size < self.size else f"{self.size}"
             raise LengthError(f"{self.kind} {self.name} ({self.id}): {len(data)} bytes, must be {wanted}")
-        given, data = len(data), data.ljust(self.size, b"\0")
+        size, data = len(data), data.ljust(self.size, b"\0")
         strict = self.kind == "telecommand" if check is None else check
         raw: list[Any] = []
         offset = 0
@@ -476,10 +476,10 @@ class Row(RowKeys):
         values: dict[str, Value] = {}
         for index, (name, item) in enumerate(self.named_fields.items()):
             number = raw[item.slot.index]
-            if item.slot.offset + item.slot.size > given:
-                if item.kind != "bytes" or item.slot.offset > given:
+            if item.slot.offset + item.slot.size > size:
+                if item.kind != "bytes" or item.slot.offset > size:
                     continue
-                number = number[: given - item.slot.offset]
+                number = number[: size - item.slot.offset]
             if item.width:
                 number = number >> item.shift & (1 << item.width) - 1
             if strict:

@@ -60,11 +60,11 @@ class Conventions(DefinitionModel):
         try:
             _unix_ns(epoch)
         except ValueError:
-            known = ", ".join((*EPOCHS, "midnight"))
+            names = ", ".join((*EPOCHS, "midnight"))
             raise PydanticCustomError(
                 "definition",
                 "{epoch} is not one of {known}, nor a date such as 2000-01-01",
-                {"epoch": repr(epoch), "known": known},
+                {"epoch": repr(epoch), "known": names},
             ) from None
         return epoch
 

@@ -1,4 +1,4 @@
-"""The interface definition of a unit, indexed by name and ID; `icd` reads it from TOML files."""
+"""The interface definition of a unit, indexed by name and ID; `starhil.protocol.unit.reader` reads it from TOML files."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Names(dict[str, _Item]):
         raise UnknownNameError(f"no {self._what} named {name!r}{hint}")
 
 
-SELECTING: Final = frozenset({"subscribe", "select_unsolicited"})
+SELECTING_ACTIONS: Final = frozenset({"subscribe", "select_unsolicited"})
 """Actions that select rows to be sent unsolicited."""
 SELECTION: Final = "unsolicited_selection"
 """Parameter that selects a row to be sent unsolicited."""
@@ -90,7 +90,7 @@ class InterfaceDefinition:
         """Rows by class and ID, and the first row with each ID by the class ""."""
         rows = tuple(self.rows)
         first = {("", row.id): row for row in reversed(rows)}
-        return first | {(row.klass, row.id): row for row in rows}
+        return first | {(row.message_class, row.id): row for row in rows}
 
     @cached_property
     def classes_by_name(self) -> Mapping[str, MessageClass]:
@@ -105,7 +105,7 @@ class InterfaceDefinition:
     @cached_property
     def selects_unsolicited(self) -> bool:
         """Whether a telecommand or a parameter may select any telemetry row to be sent unsolicited."""
-        actions = SELECTING.union(self.plugin.actions)
+        actions = SELECTING_ACTIONS.union(self.plugin.actions)
         by_command = any(row.action in actions for row in self.telecommands.values())
         return by_command or SELECTION in self.parameters or self.plugin.skipped is not None
 
@@ -114,19 +114,19 @@ class InterfaceDefinition:
         """Parameters by ID."""
         return {parameter.id: parameter for parameter in self.parameters.values()}
 
-    def row(self, row_id: int, klass: str = "") -> Row | None:
+    def row(self, row_id: int, message_class: str = "") -> Row | None:
         """Return the row with this ID in a class, or the first of any class; None if there is none."""
-        return self._rows_by_key.get((klass, row_id))
+        return self._rows_by_key.get((message_class, row_id))
 
-    def telemetry_row(self, row_id: int, klass: str | None = None) -> Row | None:
+    def telemetry_row(self, row_id: int, message_class: str | None = None) -> Row | None:
         """Return the telemetry row with this ID in a class (default: the first of any class), or None."""
         rows = (row for row in self.telemetry.values() if row.id == row_id)
-        return next((row for row in rows if klass in (None, row.klass)), None)
+        return next((row for row in rows if message_class in (None, row.message_class)), None)
 
-    def kind_of(self, row_id: int, klass: str = "") -> RequestKind:
+    def kind_of(self, row_id: int, message_class: str = "") -> RequestKind:
         """Return the kind of an ID, which need not belong to a row; without a class, an unknown one is a telecommand."""
-        if klass in self.classes_by_name:
-            return self.classes_by_name[klass].kind
+        if message_class in self.classes_by_name:
+            return self.classes_by_name[message_class].kind
         if self.first_telemetry_id is not None:
             telemetry = row_id >= self.first_telemetry_id
             return RequestKind.TELEMETRY if telemetry else RequestKind.TELECOMMAND
@@ -136,20 +136,20 @@ class InterfaceDefinition:
     @staticmethod
     def request(row: Row, data: bytes = b"", source: int = 0) -> Request:
         """Return the request for a row."""
-        return Request(row.kind, row.id, data, source, klass=row.klass)
+        return Request(row.kind, row.id, data, source, message_class=row.message_class)
 
-    def request_of(self, row_id: int, klass: str | None = None, data: bytes = b"") -> Request:
+    def request_of(self, row_id: int, message_class: str | None = None, data: bytes = b"") -> Request:
         """Return a request by ID, which need not belong to a row, and by class if the unit has classes.
 
         The default class is that of the first row with this ID, or the first class if there is none.
         """
         classes = self.classes_by_name
-        if klass is None or not classes:
+        if message_class is None or not classes:
             row = self.row(row_id)
-            klass = next(iter(classes), "") if row is None else row.klass
-        elif klass not in classes:
-            raise UnknownNameError(f"no class named {klass!r}; the unit has {', '.join(classes)}")
-        return Request(self.kind_of(row_id, klass), row_id, data, klass=klass)
+            message_class = next(iter(classes), "") if row is None else row.message_class
+        elif message_class not in classes:
+            raise UnknownNameError(f"no class named {message_class!r}; the unit has {', '.join(classes)}")
+        return Request(self.kind_of(row_id, message_class), row_id, data, message_class=message_class)
 
     def error_number(self, code: ErrorCode) -> ErrorCode | int:
         """Return the unit's code for an error."""

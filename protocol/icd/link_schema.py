@@ -344,9 +344,9 @@ class HeaderFieldModel(DefinitionModel):
         parts: list[HeaderFieldModel | HeaderBitModel] = [self, *self.bits]
         return {part.role: part for part in parts if part.role}
 
-    def in_class(self, klass: str) -> bool:
+    def in_class(self, message_class: str) -> bool:
         """Return whether messages of a class have this field."""
-        return self.classes is None or klass in self.classes
+        return self.classes is None or message_class in self.classes
 
 
 class FormatModel(DefinitionModel):

@@ -1,7 +1,8 @@
 """The keys of the files of a unit: models that reject unknown keys and wrong types.
 
-Attributes that differ from their key have the key as alias. What a field keeps when `icd_layout` places it in a row
-is in `FieldKeys`, what a row keeps is in `RowKeys`; `codec.Field` and `codec.Row` add bytes to these.
+An attribute whose name differs from its key has the key as alias. `FieldKeys` are the keys that a field keeps when
+`starhil.protocol.unit.layout` places it in a row, `RowKeys` those that a row keeps; `codec.Field` and `codec.Row` extend
+them with positions in the bytes.
 """
 
 from __future__ import annotations
@@ -158,6 +159,8 @@ class RowKeys(DefinitionModel):
     """Public source of the row."""
     action: str | None = None
     """Action that a telecommand performs, or that follows each reading of a telemetry row."""
+    confirm: bool = False
+    """Whether the console asks before it sends the telecommand, because it interrupts the unit or deletes something."""
     arguments: dict[Name, Scalar] = {}
     """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
     unsolicited: (
@@ -175,7 +178,7 @@ class RowModel(RowKeys):
     last_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
     """Expands to the rows name_1 … with the IDs `id` to `last_id` and the same layout; `[n]` is the number of
     the row. A unit has at most 65536 rows."""
-    klass: str | None = Field(default=None, alias="class")
+    message_class: str | None = Field(default=None, alias="class")
     """Class of the row; required if the unit has several classes of its kind."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Expected size of the data in bytes; the fields are checked against it."""

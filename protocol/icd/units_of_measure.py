@@ -28,11 +28,11 @@ def convertible(unit: str) -> list[str]:
     return next((list(units) for units in PER_SI_UNIT.values() if unit in units), [unit])
 
 
-def factor(unit: str, wanted: str) -> float | None:
+def factor(unit: str, target: str) -> float | None:
     """Return the factor that converts a value from one unit to another, or None if they are incompatible."""
-    if unit == wanted:
+    if unit == target:
         return 1.0
     for units in PER_SI_UNIT.values():
-        if unit in units and wanted in units:
-            return units[wanted] / units[unit]
+        if unit in units and target in units:
+            return units[target] / units[unit]
     return None

@@ -31,14 +31,14 @@ HEX: Final = {"format": "hex"}
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=100)]
 ParameterType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64", "bool", "enum8"]
 _Scalar = TypeVar("_Scalar", bound=bool | int | float | str)
-LARGEST: Final = 1e100
+LARGEST_NUMBER: Final = 1e100
 """Largest magnitude of a number in a definition: divided by a scale, it is finite."""
 
 
 def bounded(value: _Scalar) -> _Scalar:
     """Return a value that is not too large for a definition."""
-    if isinstance(value, int | float) and abs(value) > LARGEST:
-        raise PydanticCustomError("bounded", f"a number is at most {LARGEST:g}")
+    if isinstance(value, int | float) and abs(value) > LARGEST_NUMBER:
+        raise PydanticCustomError("bounded", f"a number is at most {LARGEST_NUMBER:g}")
     return value
 
 
@@ -178,10 +178,16 @@ def representable(low: float, high: float, type_: str) -> tuple[float, float]:
     return (min(low, to_f32(low)), max(high, to_f32(high))) if type_ == "f32" else (low, high)
 
 
+WIDEST_BITS: Final = 1023
+"""Most bits of a whole number that a float can hold."""
+
+
 def number_of(value: Value) -> int | float:
     """Return the value if it is a number; raise FieldError otherwise."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise FieldError(f"{value!r} is not a number")
+    if isinstance(value, int) and value.bit_length() > WIDEST_BITS:
+        raise FieldError(f"a whole number of {value.bit_length()} bits fits no field")
     return value
 
 

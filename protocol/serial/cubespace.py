@@ -122,7 +122,7 @@ class DialectReplies:
             raise ProtocolError(f"serial dialect {self._dialect} has no {reply.kind.value} messages{remedy}")
         data = b"" if reply.kind in (ReplyKind.ACK, ReplyKind.NACK) else reply.data
         values = {"id": reply.id or 0, "status": int(reply.code)}
-        return self.framing.encode(header.pack(values, reply.klass, len(data)) + data)
+        return self.framing.encode(header.pack(values, reply.message_class, len(data)) + data)
 
     def decode(self, body: bytes, pending: Request | None, reply_size: int) -> Reply | LinkFault:
         """Return the reply in a body, whose kind follows from its start byte, row and size.
@@ -136,10 +136,10 @@ class DialectReplies:
         if kinds is None:
             text = f"message {body[1]} with the start byte of a request"
             return LinkFault(FaultKind.UART_PROTOCOL, text)
-        known = pending is not None
+        is_awaited = pending is not None
         if kinds[0] in self._ids:
             row_id = body[self._ids[kinds[0]]]
-            known = pending is not None and pending.id == row_id
+            is_awaited = pending is not None and pending.id == row_id
         elif pending is not None:
             row_id = pending.id
         else:
@@ -150,7 +150,7 @@ class DialectReplies:
             kind = ReplyKind.ACK
         else:
             coded = ReplyKind.NACK in kinds and len(body) == sizes[ReplyKind.NACK]
-            kind = ReplyKind.NACK if coded and known and reply_size != 1 else ReplyKind.TELEMETRY
+            kind = ReplyKind.NACK if coded and is_awaited and reply_size != 1 else ReplyKind.TELEMETRY
         data = body[sizes[kind] :]
         code: ErrorCode | int = ErrorCode.OK
         if kind in self._coded:
@@ -160,7 +160,13 @@ class DialectReplies:
                 return LinkFault(FaultKind.UART_PROTOCOL, f"{name} {row_id} has {codes} bytes, must be 1")
             code = error_code(body[-1])
             kind = ReplyKind.NACK if code else kind
-        return Reply(kind, row_id, data, code, klass=pending.klass if known and pending is not None else "")
+        return Reply(
+            kind,
+            row_id,
+            data,
+            code,
+            message_class=pending.message_class if is_awaited and pending is not None else "",
+        )
 
     def _is_burst(self, body: bytes, pending: Request | None, reply_size: int) -> bool:
         size, place = self._sizes[ReplyKind.BURST] + BURST_SIZE, self._ids[ReplyKind.BURST]

@@ -29,7 +29,6 @@ class MessageFormat:
 
     framing: Framing
     model: FramingModel
-    """Keys of the framing."""
     check: Check
     header: HeaderCodec
     classes: Sequence[str] = ()
@@ -40,15 +39,16 @@ class MessageFormat:
         return self.model.request_size if isinstance(self.model, FixedFraming) else None
 
     @cached_property
-    def _klass(self) -> str:
+    def _message_class(self) -> str:
         """The class of all messages, if there is only one."""
         return self.classes[0] if len(self.classes) == 1 else ""
 
-    def close(self, header: bytes, data: bytes) -> bytes:
-        """Return header, data and check of a message."""
+    def close(self, header: bytes, data: bytes, *, wrong_check: bool = False) -> bytes:
+        """Return header, data and check of a message; each bit of a wrong check is inverted."""
         if not self.check.size:
             return header + data
-        return header + data + self.check.compute(self._covered(header, data))
+        check = self.check.compute(self._covered(header, data))
+        return header + data + (bytes(byte ^ 0xFF for byte in check) if wrong_check else check)
 
     def _covered(self, header: bytes, data: bytes) -> bytes:
         covers = self.check.covers
@@ -63,7 +63,7 @@ class MessageFormat:
         header = self.header
         end = len(body) - self.check.size
         try:
-            envelope = header.unpack(body[: max(end, 0)], self._klass)
+            envelope = header.unpack(body[: max(end, 0)], self._message_class)
         except HeaderError as error:
             if {"header", "data"} <= self.check.covers and not self._checks(body, 0, end):
                 return self._bad_check(body[end:])
@@ -105,7 +105,7 @@ class MessageFormat:
         `data_size` returns the size of the data if the header carries no length. Raises BodySizeError.
         """
         try:
-            envelope = self.header.unpack(body, self._klass)
+            envelope = self.header.unpack(body, self._message_class)
             if envelope is None:
                 return None
             data = self.header.data_size(envelope) if "length" in self.header.roles else data_size(envelope)
@@ -141,9 +141,9 @@ class Formats:
                 )
             starts[start] = form
 
-    def of(self, klass: str) -> MessageFormat:
+    def of(self, message_class: str) -> MessageFormat:
         """Return the format of the messages of a class."""
-        return next((form for form in self.all if klass in form.classes), self.other)
+        return next((form for form in self.all if message_class in form.classes), self.other)
 
     def deframer(
         self,

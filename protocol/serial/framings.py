@@ -111,14 +111,14 @@ class _Collector(Deframer[_Message]):
 
     def _find_start(self, start: re.Pattern[bytes]) -> bool:
         """Drop junk before the next start; return whether that is complete: see `_start_pattern`."""
-        found = start.search(self._buffer)
-        size = len(self._buffer) if found is None else found.start()
+        match = start.search(self._buffer)
+        size = len(self._buffer) if match is None else match.start()
         if size:
             if size > self._reported and not self._in_junk:
                 self._fault(FaultKind.UART_PROTOCOL, f"byte {self._buffer[0]:02X} outside a message")
             self._in_junk = True
             self._drop(size)
-        return found is not None and found.lastindex == 1
+        return match is not None and match.lastindex == 1
 
     def _drop(self, size: int) -> None:
         del self._buffer[:size]
@@ -222,12 +222,12 @@ class _DelimitedDeframer(_Collector[_Message]):
 
     def _take(self) -> bool:
         end = self._framing.end
-        found = self._buffer.find(end)
-        size = len(self._buffer) if found < 0 else found
+        position = self._buffer.find(end)
+        size = len(self._buffer) if position < 0 else position
         if size > self._limit and not self._in_junk:
             self._add(self._overlong())
             self._in_junk = True
-        if found < 0:
+        if position < 0:
             self._drop(size - len(end) + 1 if size > self._limit else 0)
             return False
         text = bytes(self._buffer[:size])
@@ -447,9 +447,9 @@ class _CountedDeframer(_Collector[_Message]):
         whole = last + len(end)
         if len(self._buffer) < whole:
             return False
-        found = bytes(self._buffer[last:whole])
-        if found != end:
-            text = f"{found.hex(' ').upper()} instead of the end of a message"
+        end_bytes = bytes(self._buffer[last:whole])
+        if end_bytes != end:
+            text = f"{end_bytes.hex(' ').upper()} instead of the end of a message"
             return self._reject(LinkFault(FaultKind.UART_PROTOCOL, text), whole)
         result = self._receiving.interpret(body[:size])
         if isinstance(result, LinkFault):

@@ -9,7 +9,7 @@ from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.icd.conventions import NANOSECONDS, Order
 from starhil.protocol.icd.link_schema import HeaderFieldModel
 
-WRAPPING: Final = frozenset(("ticks", "time", "sequence"))
+WRAPPING_ROLES: Final = frozenset(("ticks", "time", "sequence"))
 """Roles whose values wrap around."""
 
 
@@ -22,7 +22,7 @@ class HeaderContent(NamedTuple):
 
     values: Mapping[str, int]
     size: int
-    klass: str
+    message_class: str
     """Name of the class, or an empty text."""
 
 
@@ -77,16 +77,20 @@ class HeaderCodec:
         )
         """Messages whose `sequence` the sender counts: `reply`, `unsolicited`."""
 
-    def roles_in(self, klass: str) -> frozenset[str]:
+    def roles_in(self, message_class: str) -> frozenset[str]:
         """Return the roles that the header carries in messages of a class."""
-        return frozenset(role for field in self.fields if field.in_class(klass) for role in field.by_role)
+        return frozenset(
+            role for field in self.fields if field.in_class(message_class) for role in field.by_role
+        )
 
-    def size(self, klass: str) -> int:
+    def size(self, message_class: str) -> int:
         """Return the size of the header in messages of a class."""
-        found = self._sizes.get(klass)
-        if found is None:
-            found = self._sizes[klass] = sum(field.size for field in self.fields if field.in_class(klass))
-        return found
+        size = self._sizes.get(message_class)
+        if size is None:
+            size = self._sizes[message_class] = sum(
+                field.size for field in self.fields if field.in_class(message_class)
+            )
+        return size
 
     def count_ns(self, role: str) -> int:
         """Return the nanoseconds per count of `ticks` or `time`."""
@@ -97,20 +101,20 @@ class HeaderCodec:
         fixed, headers, data = self._counted
         return fixed + headers * header_size + data * data_size
 
-    def pack(self, values: Mapping[str, int], klass: str, data_size: int) -> bytes:
+    def pack(self, values: Mapping[str, int], message_class: str, data_size: int) -> bytes:
         """Return the header of a message with `data_size` bytes of data.
 
         Raises HeaderError if a value does not fit its field.
         """
         packed = b""
         for role, size, order, signed, _, default, classes, bits in self._steps:
-            if classes is not None and klass not in classes:
+            if classes is not None and message_class not in classes:
                 continue
             if bits:
                 value = 0
                 for name, shift, mask, _, given in bits:
                     part = given if name is None else values.get(name, given)
-                    if name in WRAPPING:
+                    if name in WRAPPING_ROLES:
                         part &= mask
                     if not 0 <= part <= mask:
                         raise self._misfit(name, part, mask.bit_length())
@@ -118,10 +122,10 @@ class HeaderCodec:
             elif role is None:
                 value = default
             elif role == "length":
-                value = self.length(self.size(klass), data_size)
+                value = self.length(self.size(message_class), data_size)
             else:
                 value = values.get(role, default)
-            if role in WRAPPING:
+            if role in WRAPPING_ROLES:
                 packed += (value & (1 << 8 * size) - 1).to_bytes(size, order)
                 continue
             try:
@@ -133,7 +137,7 @@ class HeaderCodec:
     def _misfit(self, role: str | None, value: int, bits: int) -> HeaderError:
         return HeaderError(f"{self._where}: {role or 'constant'} {value} does not fit {bits} bits")
 
-    def unpack(self, body: bytes, klass: str = "") -> HeaderContent | None:
+    def unpack(self, body: bytes, message_class: str = "") -> HeaderContent | None:
         """Decode the header of a body of a class, if that is known; return None if the body is too short.
 
         Raises HeaderError for a wrong constant or an unknown class.
@@ -141,7 +145,7 @@ class HeaderCodec:
         values: dict[str, int] = {}
         position = 0
         for role, size, order, signed, const, _, classes, bits in self._steps:
-            if classes is not None and klass not in classes:
+            if classes is not None and message_class not in classes:
                 continue
             end = position + size
             if end > len(body):
@@ -152,17 +156,17 @@ class HeaderCodec:
             if role is not None:
                 values[role] = value
             for name, shift, mask, required, _ in bits:
-                found = value >> shift & mask
-                if required is not None and found != required:
-                    raise HeaderError(f"header has bits {found:#x}, expected {required:#x}")
+                field_bits = value >> shift & mask
+                if required is not None and field_bits != required:
+                    raise HeaderError(f"header has bits {field_bits:#x}, expected {required:#x}")
                 if name is not None:
-                    values[name] = found
-            if not klass and "class" in values:
+                    values[name] = field_bits
+            if not message_class and "class" in values:
                 if values["class"] not in self._classes:
                     raise HeaderError(f"no class with code {values['class']}")
-                klass = self._classes[values["class"]]
+                message_class = self._classes[values["class"]]
             position = end
-        return HeaderContent(values, position, klass)
+        return HeaderContent(values, position, message_class)
 
     def address_in(self, body: bytes) -> int | None:
         """Return the address in a body, which may be incomplete or damaged; None if the header carries none in every message."""

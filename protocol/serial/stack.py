@@ -6,7 +6,7 @@
             └──────────────── body ─────────────────────────┘
 
 A link is composed of a framing, which marks where a body begins and ends (`framings`), a check (`checks`), a header of
-requests and one of replies (`envelope`), whose roles give the kind of a reply. Only the replies of CubeSpace have another
+requests and one of replies (`headers`), whose roles give the kind of a reply. Only CubeSpace's replies have a separate
 header for each kind, and dialects (`cubespace`).
 """
 
@@ -30,6 +30,7 @@ from starhil.protocol.messages import (
     DEFAULT_MAX_SIZE,
     ErrorCode,
     FaultKind,
+    Flaw,
     LinkFault,
     Reply,
     ReplyKind,
@@ -86,9 +87,8 @@ class SerialStack:
         self.text_formats: Final = [
             form
             for form in self.request_formats.all
-            if any(row.request for row in rows if self.request_formats.of(row.klass) is form)
+            if any(row.request for row in rows if self.request_formats.of(row.message_class) is form)
         ]
-        """Formats of requests that are texts."""
         self.requests: Final = self.request_formats.other
         """Format of requests without a class."""
         self.replies: Final = self.reply_formats.other
@@ -109,25 +109,25 @@ class SerialStack:
 
     def _formats_of(self, direction: str, models: Sequence[HeaderFieldModel]) -> Formats:
         """Return the formats of a direction; one of classes that have no messages in it is left out."""
-        found = []
+        formats = []
         names = {*self.classes} or {""}
         left = {name for name in names if self._has_messages(name, direction, models)}
         for number, item in enumerate(self.link.format, 1):
             self._check_format(item, f"link.serial.format {number}")
             used = item.classes is None or not left.isdisjoint(item.classes)
             if item.direction in (None, direction) and used:
-                found.append(self._format(f"{direction}_header", models, item))
+                formats.append(self._format(f"{direction}_header", models, item))
                 left.difference_update(item.classes or ())
-        if not found or (left and all(form.classes for form in found)):
-            found.append(self._format(f"{direction}_header", models))
-        return Formats(found, direction)
+        if not formats or (left and all(form.classes for form in formats)):
+            formats.append(self._format(f"{direction}_header", models))
+        return Formats(formats, direction)
 
-    def _has_messages(self, klass: str, direction: str, models: Sequence[HeaderFieldModel]) -> bool:
+    def _has_messages(self, message_class: str, direction: str, models: Sequence[HeaderFieldModel]) -> bool:
         """Return whether there are requests, or replies and refusals, of rows of a class."""
-        rows = [row for row in self.rows if row.klass == klass]
+        rows = [row for row in self.rows if row.message_class == message_class]
         if direction == "request":
             return not rows or any(not row.only_sent for row in rows)
-        roles = {role for model in models if model.in_class(klass) for role in model.by_role}
+        roles = {role for model in models if model.in_class(message_class) for role in model.by_role}
         refused = bool(roles & {"status", "ack"}) or self.link.refusal is not None
         return refused or not rows or any(row.answers or row.kind is RequestKind.TELEMETRY for row in rows)
 
@@ -154,8 +154,8 @@ class SerialStack:
         checks = build_check(check, self.byte_order, self._plugin.checks)
         overhead = {"start": len(frames.start), "check": checks.size, "end": len(frames.end)}
         codes = {
-            code: klass
-            for klass, coded in self.classes.items()
+            code: message_class
+            for message_class, coded in self.classes.items()
             if coded.code is not None
             for code in ((coded.code,) if name == "request_header" else (coded.reply_code, coded.unsolicited))
             if code is not None
@@ -212,11 +212,19 @@ class SerialStack:
         replies = self.in_dialect(dialect)
         return replies is None or ReplyKind.UNSOLICITED in replies.headers
 
-    def marks_unsolicited(self, klass: str) -> bool:
+    def marks_unsolicited(self, message_class: str) -> bool:
         """Return whether unsolicited telemetry of a class differs from an answer by more than that nothing requested it."""
-        item = self.classes.get(klass)
+        item = self.classes.get(message_class)
         codes = item is not None and item.code is not None and item.unsolicited_code != item.reply_code
         return bool(self.dialects) or codes
+
+    @property
+    def shown_in_replies(self) -> frozenset[str]:
+        """What a reply carries besides its data, in some class or dialect: `id`, `sequence`, `check`."""
+        headers = [self.replies.header, *(h for d in self._in_dialect.values() for h in d.headers.values())]
+        roles = {role for header in headers for role in header.roles}
+        checked = {"check"} if any(form.check.size for form in self.reply_formats.all) else set()
+        return frozenset(roles & {"id", "sequence"} | checked)
 
     def counts(self, kind: ReplyKind) -> bool:
         """Return whether the device numbers messages of this kind itself."""
@@ -241,13 +249,13 @@ class SerialStack:
 
         Raises ProtocolError for data or an unknown ID if requests are texts.
         """
-        return self.request_formats.of(request.klass).framing.encode(self.request_body(request))
+        return self.request_formats.of(request.message_class).framing.encode(self.request_body(request))
 
     def request_body(self, request: Request) -> bytes:
         """Return header, data and check of a request."""
-        form = self.request_formats.of(request.klass)
+        form = self.request_formats.of(request.message_class)
         if form in self.text_formats:
-            row = self.icd.row(request.id, request.klass)
+            row = self.icd.row(request.id, request.message_class)
             if row is None or not row.request or request.data:
                 what = f"no text requests ID {request.id}" if row is None else "a text has no data"
                 raise ProtocolError(f"link.serial: {what}")
@@ -260,8 +268,8 @@ class SerialStack:
         if not request.polled:
             values["poll"] = 0
         if "class" in self.requests.header.roles:
-            values["class"] = self._coded(request.klass).code or 0
-        return form.close(form.header.pack(values, request.klass, len(request.data)), request.data)
+            values["class"] = self._coded(request.message_class).code or 0
+        return form.close(form.header.pack(values, request.message_class, len(request.data)), request.data)
 
     def encode_reply(self, reply: Reply, dialect: Dialect | None = None) -> bytes:
         """Return a reply as bytes on the line; empty for a refusal that the unit's header cannot express.
@@ -275,20 +283,21 @@ class SerialStack:
             return b"" if silent else in_dialect.encode(reply)
         if reply.kind is ReplyKind.ECHO:
             echo = Request(
-                RequestKind.TELECOMMAND, reply.id or 0, reply.data, reply.destination, reply.klass, reply.sequence,
+                RequestKind.TELECOMMAND, reply.id or 0, reply.data, reply.destination, reply.message_class, reply.sequence,
                 reply.flags,
             )  # fmt: skip
             return self.encode_request(echo)
+        wrong_check = Flaw.CHECK in reply.flaw
         text = self.texts.encode(reply)
         if text is not None:
-            return self.replies.framing.encode(self.replies.close(b"", text))
+            return self.replies.framing.encode(self.replies.close(b"", text, wrong_check=wrong_check))
         header = self.replies.header
-        if refused and not header.roles_in(reply.klass) & {"status", "ack"}:
+        if refused and not header.roles_in(reply.message_class) & {"status", "ack"}:
             return b""
         values = {
             "id": reply.id or 0,
             "destination": reply.destination,
-            "sequence": reply.sequence,
+            "sequence": reply.sequence + (Flaw.SEQUENCE in reply.flaw),
             "status": int(reply.code),
             "ack": int(not refused),
             "final": int(reply.final),
@@ -300,12 +309,12 @@ class SerialStack:
         if "time" in header.roles:
             values["time"] = reply.time_ns // header.count_ns("time")
         if "class" in header.roles:
-            item = self._coded(reply.klass)
+            item = self._coded(reply.message_class)
             unsolicited = reply.kind is ReplyKind.UNSOLICITED
             values["class"] = (item.unsolicited_code if unsolicited else item.reply_code) or 0
-        form = self.reply_formats.of(reply.klass)
-        header_bytes = form.header.pack(values, reply.klass, len(reply.data))
-        return form.framing.encode(form.close(header_bytes, reply.data))
+        form = self.reply_formats.of(reply.message_class)
+        header_bytes = form.header.pack(values, reply.message_class, len(reply.data))
+        return form.framing.encode(form.close(header_bytes, reply.data, wrong_check=wrong_check))
 
     def _request_of(self, form: MessageFormat, body: bytes) -> Request | LinkFault:
         if form in self.text_formats:
@@ -315,22 +324,22 @@ class SerialStack:
             row = self._by_text.get(words(text.decode("latin-1")))
             if row is None:
                 return Request(RequestKind.TELECOMMAND, self._unknown_id)
-            return Request(row.kind, row.id, klass=row.klass)
+            return Request(row.kind, row.id, message_class=row.message_class)
         opened = form.open(body)
         if isinstance(opened, LinkFault):
             return opened
         envelope, data = opened
         values = envelope.values
-        row_id, klass = values["id"], envelope.klass
-        if not klass:
+        row_id, message_class = values["id"], envelope.message_class
+        if not message_class:
             row = self.icd.row(row_id)
-            klass = row.klass if row is not None else ""
+            message_class = row.message_class if row is not None else ""
         return Request(
-            self.icd.kind_of(row_id, klass),
+            self.icd.kind_of(row_id, message_class),
             row_id,
             data,
             values.get("source", 0),
-            klass,
+            message_class,
             values.get("sequence", 0),
             values.get("flags", 0),
             bool(values.get("poll", 1)),
@@ -343,7 +352,7 @@ class SerialStack:
         return form.measure(body, self._request_data_size)
 
     def _request_data_size(self, envelope: HeaderContent) -> int:
-        row = self.icd.row(envelope.values["id"], envelope.klass)
+        row = self.icd.row(envelope.values["id"], envelope.message_class)
         if row is None:
             raise HeaderError(f"no row with id {envelope.values['id']}")
         return row.request_size
@@ -397,7 +406,7 @@ class HostReceiver:
 
     def overhear(self, request: Request) -> None:
         """Read what arrives next as the answer to a request that has been sent by another, or earlier."""
-        row = self._stack.icd.row(request.id, request.klass)
+        row = self._stack.icd.row(request.id, request.message_class)
         answers = self._stack.answers(row) if row is not None else ("reply",)
         self._pending = request
         self._reply_size = row.reply_size if row is not None else 0
@@ -414,7 +423,9 @@ class HostReceiver:
         """Return the request that a reply without an ID answers; None if its class has another format."""
         pending = self._pending
         return (
-            pending if pending is not None and self._stack.reply_formats.of(pending.klass) is form else None
+            pending
+            if pending is not None and self._stack.reply_formats.of(pending.message_class) is form
+            else None
         )
 
     def _data_size(self, form: MessageFormat, envelope: HeaderContent) -> int:
@@ -447,8 +458,8 @@ class HostReceiver:
         row_id = values.get("id", None if pending is None else pending.id)
         if row_id is None:
             return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
-        klass = _class_of(envelope, row_id, pending)
-        kind = self._kind(envelope, klass, row_id)
+        message_class = _class_of(envelope, row_id, pending)
+        kind = self._kind(envelope, message_class, row_id)
         if kind is ReplyKind.ACK and not values and stack.texts.acknowledge is not None:
             return LinkFault(FaultKind.UART_PROTOCOL, f"{body[:16]!r} is no acknowledge")
         if values.get("final", 1) and kind is not ReplyKind.UNSOLICITED:
@@ -460,7 +471,7 @@ class HostReceiver:
             error_code(values.get("status", 0)) if kind is ReplyKind.NACK else ErrorCode.OK,
             source=values.get("address", 0),
             destination=values.get("destination", 0),
-            klass=klass,
+            message_class=message_class,
             sequence=values.get("sequence", 0),
             flags=values.get("flags", 0),
             final=bool(values.get("final", 1)),
@@ -473,7 +484,7 @@ class HostReceiver:
         if pending is None or (kind is ReplyKind.ACK and pending.kind is not RequestKind.TELECOMMAND):
             return LinkFault(FaultKind.UART_PROTOCOL, f"{kind.value} without a request")
         self._pending = None
-        return Reply(kind, pending.id, code=error_code(code), klass=pending.klass)
+        return Reply(kind, pending.id, code=error_code(code), message_class=pending.message_class)
 
     def _check_echo(self, body: bytes) -> Reply | LinkFault | None:
         expected, self._echo = self._echo, None
@@ -483,15 +494,15 @@ class HostReceiver:
         if not self._only_echo:
             return None
         self._pending = None
-        return Reply(ReplyKind.ACK, pending.id, klass=pending.klass)
+        return Reply(ReplyKind.ACK, pending.id, message_class=pending.message_class)
 
-    def _kind(self, envelope: HeaderContent, klass: str, row_id: int) -> ReplyKind:
+    def _kind(self, envelope: HeaderContent, message_class: str, row_id: int) -> ReplyKind:
         values, stack = envelope.values, self._stack
         if values.get("status", 0) or not values.get("ack", 1):
             return ReplyKind.NACK
         if values.get("class") in stack.unsolicited:
             return ReplyKind.UNSOLICITED
-        telecommand = stack.icd.kind_of(row_id, klass) is RequestKind.TELECOMMAND
+        telecommand = stack.icd.kind_of(row_id, message_class) is RequestKind.TELECOMMAND
         return ReplyKind.ACK if telecommand else ReplyKind.TELEMETRY
 
     def _reply_in_dialect(self, in_dialect: DialectReplies, body: bytes) -> Reply | LinkFault:
@@ -503,9 +514,9 @@ class HostReceiver:
 
 def _class_of(envelope: HeaderContent, row_id: int, pending: Request | None) -> str:
     """Return the class of a reply, or of the request that it answers if its header has none."""
-    if not envelope.klass and pending is not None and pending.id == row_id:
-        return pending.klass
-    return envelope.klass
+    if not envelope.message_class and pending is not None and pending.id == row_id:
+        return pending.message_class
+    return envelope.message_class
 
 
 def dialects_of(link: SerialLinkModel | None) -> tuple[Dialect, ...]:
@@ -520,23 +531,23 @@ def default_dialect(dialects: Sequence[Dialect]) -> Dialect | None:
     return dialects[0] if len(dialects) == 1 else Dialect.B if dialects else None
 
 
-def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | None:
+def chosen_dialect(icd: InterfaceDefinition, name: str | None) -> Dialect | None:
     """Return the dialect of serial replies of a unit; None if it has no dialects.
 
     Parameters
     ----------
     icd
         Definition of the unit.
-    wanted
+    name
         The user's choice; None for the default: the only dialect of the unit, otherwise b.
 
     Raises IcdError: the unit does not have this dialect.
     """
     dialects = dialects_of(icd.link.serial)
-    if wanted is None:
+    if name is None:
         return default_dialect(dialects)
     if not dialects:
         raise IcdError(f"unit {icd.name} has no reply dialects; do not select one")
-    if wanted not in dialects:
+    if name not in dialects:
         raise IcdError(f"unit {icd.name} has only dialect {', '.join(dialects)}; do not select another")
-    return Dialect(wanted)
+    return Dialect(name)

@@ -18,6 +18,9 @@ FIRST_PAUSE_S: Final = 0.05
 LAST_PAUSE_S: Final = 1.0
 """Pauses between attempts to reconnect double from the first to the last."""
 
+TURN_S: Final = 0.002
+"""Time after which a transport leaves the loop to others, if more has arrived, seconds: a frame may be any amount of work."""
+
 Item = TypeVar("Item")
 
 Receive = Callable[[Item], None]

@@ -1,7 +1,7 @@
 """Fair sharing of an event loop by many connections, a limit of their number, and socket options for TCP.
 
-Each connection reads a limited amount per turn of the loop.
-A server without a limit would take every file descriptor of the process, and links could not be reopened.
+Each connection reads a bounded amount per turn of the loop. Without a limit on their number, connections could use up all
+file descriptors of the process, and links could not be reopened.
 """
 
 from __future__ import annotations

@@ -115,8 +115,6 @@ class FairQueue:
 
 
 class _Client(TurnProtocol):
-    """One connection."""
-
     _transport: asyncio.Transport
 
     def __init__(self, hub: CanHub) -> None:
@@ -153,7 +151,6 @@ class _Client(TurnProtocol):
         self._write_waiting()
 
     def data_received(self, data: bytes) -> None:
-        """Execute the received commands."""
         self._end_settling()
         frames: list[CanFrame] = []
         for command in self._splitter.feed(data):
@@ -253,7 +250,6 @@ class CanHub:
         self._now = now
         self._server: asyncio.Server | None = None
         self.clients: Final[list[_Client]] = []
-        """Clients connected now."""
 
     async def start(self) -> None:
         """Listen. Raises ProtocolError if the address or the log is not available."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import time
 from typing import Final
 
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.can.socketcand import CommandError, CommandSplitter, format_send, parse_frame
 from starhil.protocol.errors import ProtocolError, reason
-from starhil.protocol.transports.base import ReconnectingTransport, TransportError
+from starhil.protocol.transports.base import TURN_S, ReconnectingTransport, TransportError
 from starhil.protocol.transports.connections import detect_lost_peer, limit_buffers
 from starhil.protocol.transports.hub import DEFAULT_BUS, CanHub
 
@@ -20,7 +21,7 @@ BACKLOG_LIMIT: Final = 4 * 1024 * 1024
 """Maximum number of bytes that wait for a hub that does not read."""
 
 READ_SIZE: Final = 512
-"""Maximum number of bytes that are read per turn of the loop: some 15 frames, 2 ms of work for a device."""
+"""Maximum number of bytes that are read per turn of the loop: some 15 frames."""
 
 HANDSHAKE_S: Final = 5.0
 """Longest time for the server's greeting and answers."""
@@ -96,7 +97,11 @@ class HubTransport(ReconnectingTransport[CanFrame]):
         """
         splitter = CommandSplitter()
         while data := await reader.read(READ_SIZE):
+            begin_s = time.monotonic()
             for command in splitter.feed(data):
+                if time.monotonic() - begin_s > TURN_S:
+                    await asyncio.sleep(0)
+                    begin_s = time.monotonic()
                 self._receive_command(command)
             await asyncio.sleep(0)  # the loop serves other connections, and the outbox is written
             await writer.drain()
@@ -156,7 +161,7 @@ class HubTransport(ReconnectingTransport[CanFrame]):
 
 
 class AutoHubTransport(HubTransport):
-    """Joins the hub at an address, and starts it in this process whenever nobody listens there.
+    """Joins the hub at an address, and starts it in this process if there is none.
 
     Port 0 starts a new hub at a free port.
     """

@@ -1,7 +1,7 @@
 """Serial transport over a pseudo-terminal, with detection of peers on its slave side.
 
 Unlike a wire, a pseudo-terminal stores bytes for an absent reader. The master reports a hang-up while no
-process has the slave side open; if a peer leaves and another comes at once, only inotify reports this.
+process has the slave side open; if one peer closes it and another opens it immediately, only inotify reports the change.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from typing import Final
 import can
 
 from starhil.protocol.can.frame import CanFrame
-from starhil.protocol.transports.base import ReconnectingTransport, TransportError
+from starhil.protocol.transports.base import TURN_S, ReconnectingTransport, TransportError
 
 QUEUE_LIMIT: Final = 10_000
 """Maximum number of frames that wait for the bus."""
@@ -26,7 +26,7 @@ READ_TIMEOUT_S: Final = 0.2
 """Timeout of one read in the reader thread (for buses without a file descriptor)."""
 
 READS_PER_TURN: Final = 16
-"""Maximum number of frames read per turn of the loop, some 2 ms of work for a device."""
+"""Maximum number of frames read per turn of the loop."""
 
 SENDS_PER_TURN: Final = 64
 """Frames sent per turn of the loop."""
@@ -99,7 +99,10 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
     def _readable(self) -> None:
         """Read once per turn of the loop while frames are waiting."""
         self._next_read = None
+        until_s = time.monotonic() + TURN_S
         for _ in range(READS_PER_TURN):
+            if time.monotonic() > until_s:
+                break
             bus = self._bus
             if bus is None:
                 return

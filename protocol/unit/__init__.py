@@ -1,4 +1,4 @@
-"""A unit read from its folder: parsed, laid out, checked, and shown by example."""
+"""Reading of a unit from its folder: parsing, layout, checks, and example exchanges."""
 
 from starhil.protocol.unit.reader import load_unit, read_definition
 

@@ -91,14 +91,14 @@ def _check_value(field: Field, row: Row, icd: InterfaceDefinition) -> None:
     name = str(field.value)
     if row.kind != "telemetry":
         raise IcdError("`value` is for telemetry; a field of a telecommand has an `argument`")
-    found = quantity_of(name, icd)
-    if found is None and icd.plugin.skipped is not None:
+    quantity = quantity_of(name, icd)
+    if quantity is None and icd.plugin.skipped is not None:
         return
-    if found is None:
+    if quantity is None:
         raise IcdError(f"no quantity named {name!r}{icd.model.near_quantities(name)}")
     if name not in icd.plugin.quantities:
-        _check_fit(field, found, f"quantity {name}", icd.model)
-        _check_members(field, found, icd.model)
+        _check_fit(field, quantity, f"quantity {name}", icd.model)
+        _check_members(field, quantity, icd.model)
 
 
 def _check_argument(field: Field, row: Row, action: ActionModel | None, model: DeviceModel) -> None:
@@ -109,48 +109,48 @@ def _check_argument(field: Field, row: Row, action: ActionModel | None, model: D
         raise IcdError(f"argument {name}: the row has no `action`")
     if action is None:
         return  # unknown, or an action of the plugin
-    found = model.argument(action, name)
-    if found is None:
-        known = [item.name for item in action.arguments]
+    argument = model.argument(action, name)
+    if argument is None:
+        arguments = [item.name for item in action.arguments]
         raise IcdError(
-            f"action {action.name} has no argument {name!r}{did_you_mean(name, known)} "
-            f"(known: {', '.join(known) or 'none'})"
+            f"action {action.name} has no argument {name!r}{did_you_mean(name, arguments)} "
+            f"(known: {', '.join(arguments) or 'none'})"
         )
-    _check_fit(field, found, f"argument {name}", model)
-    if found.enum is not None and field.enum is not None:
+    _check_fit(field, argument, f"argument {name}", model)
+    if argument.enum is not None and field.enum is not None:
         names = [*field.enum.values, *field.aliases]
-        wrong = [item for item in names if item not in model.enums[found.enum].values]
+        wrong = [item for item in names if item not in model.enums[argument.enum].values]
         if wrong:
-            hint = did_you_mean(wrong[0], model.enums[found.enum].values)
+            hint = did_you_mean(wrong[0], model.enums[argument.enum].values)
             raise IcdError(f"{wrong[0]!r} is not a value of argument {name}{hint}")
 
 
-def _check_fit(field: Field, found: QuantityModel | ArgumentModel, what: str, model: DeviceModel) -> None:
+def _check_fit(field: Field, source: QuantityModel | ArgumentModel, what: str, model: DeviceModel) -> None:
     """Check that a field can hold the values of a quantity or argument, and that the units are compatible."""
-    if found.unit != ANY_UNIT and factor(found.unit, field.unit) is None:
-        units = ", ".join(repr(unit) for unit in convertible(found.unit))
-        raise IcdError(f"unit {field.unit!r}, but {what} is in {found.unit!r}; use one of {units}")
-    names = found.enum is not None or found.type == "text"
+    if source.unit != ANY_UNIT and factor(source.unit, field.unit) is None:
+        units = ", ".join(repr(unit) for unit in convertible(source.unit))
+        raise IcdError(f"unit {field.unit!r}, but {what} is in {source.unit!r}; use one of {units}")
+    names = source.enum is not None or source.type == "text"
     fits = {
         "bytes": field.kind == "bytes",
         "text": field.kind in ("enum", "text"),
         "bool": field.kind in ("flag", "integer", "bits", "enum"),
-    }.get(found.type, field.kind in ("integer", "float", "bits", "enum", "flag"))
+    }.get(source.type, field.kind in ("integer", "float", "bits", "enum", "flag"))
     if names and field.kind not in ("enum", "text"):
-        members = "" if found.enum is None else f": {', '.join(model.enums[found.enum].values)}"
+        members = "" if source.enum is None else f": {', '.join(model.enums[source.enum].values)}"
         raise IcdError(f"{what} has named values{members}; assign numbers with `enum` or `map`")
     if not fits:
-        raise IcdError(f"{what} is of type {found.type}, which a field of kind {field.kind} cannot hold")
+        raise IcdError(f"{what} is of type {source.type}, which a field of kind {field.kind} cannot hold")
 
 
-def _check_members(field: Field, found: QuantityModel, model: DeviceModel) -> None:
+def _check_members(field: Field, quantity: QuantityModel, model: DeviceModel) -> None:
     """Check that an enumeration has a number for every value of the quantity."""
     if field.enum is None or field.default is not None:
         return
-    wanted = ["true", "false"] if found.type == "bool" else []
-    if found.enum is not None:
-        wanted = list(model.enums[found.enum].values)
-    missing = [name for name in wanted if name not in field.enum.values and name not in field.aliases]
+    members = ["true", "false"] if quantity.type == "bool" else []
+    if quantity.enum is not None:
+        members = list(model.enums[quantity.enum].values)
+    missing = [name for name in members if name not in field.enum.values and name not in field.aliases]
     if missing:
         names = ", ".join(missing)
         raise IcdError(f"quantity {field.value} has no number for {names}; add one, or a `default`")

@@ -64,7 +64,7 @@ def served(icd: InterfaceDefinition) -> tuple[list[str], list[Exchange]]:
     errors = _unserved_rows(icd)
     if errors:
         return errors, []
-    found: list[Exchange] = []
+    exchanges: list[Exchange] = []
     failed: dict[str, list[Row]] = {}
     for row, link, example in _examples(icd):
         try:
@@ -74,7 +74,7 @@ def served(icd: InterfaceDefinition) -> tuple[list[str], list[Exchange]]:
             for text in error.args:
                 failed.setdefault(text, []).append(row)
         else:
-            found += [] if exchange is None else [exchange]
+            exchanges += [] if exchange is None else [exchange]
     for text, rows in failed.items():
         more = len(rows) - 1
         errors.append(
@@ -85,7 +85,7 @@ def served(icd: InterfaceDefinition) -> tuple[list[str], list[Exchange]]:
             build_eds(DeviceDictionary(icd))
         except ProtocolError as error:
             errors += error.args
-    return errors, found
+    return errors, exchanges
 
 
 def _unserved_rows(icd: InterfaceDefinition) -> list[str]:
@@ -141,7 +141,9 @@ def _serial_exchange(
         answers = tuple(_hex(data) for reply in replies if (data := stack.encode_reply(reply)))
     if request is not None and "reply" in stack.answers(row):
         with _Part("refusal"):
-            stack.encode_reply(Reply(ReplyKind.NACK, row.id, code=ErrorCode.INVALID_ID, klass=row.klass))
+            stack.encode_reply(
+                Reply(ReplyKind.NACK, row.id, code=ErrorCode.INVALID_ID, message_class=row.message_class)
+            )
     return Exchange(row, link, sent, answers, values)
 
 
@@ -180,7 +182,7 @@ def _messages(
     """Return the request for a row and its answers; of a row that is only sent, no request and the message."""
     if row.only_sent:
         data = row.encode(values, saturate=True)
-        return None, [Reply(ReplyKind.UNSOLICITED, row.id, data, klass=row.klass)]
+        return None, [Reply(ReplyKind.UNSOLICITED, row.id, data, message_class=row.message_class)]
     request = icd.request(row, row.encode(values) if row.kind == "telecommand" else b"")
     replies = []
     for answer in answers:
@@ -188,10 +190,10 @@ def _messages(
         if answer == "echo":
             replies.append(Reply.echo(request))
         elif named.kind == "telecommand":
-            replies.append(Reply(ReplyKind.ACK, row.id, klass=row.klass))
+            replies.append(Reply(ReplyKind.ACK, row.id, message_class=row.message_class))
         else:
             data = named.encode(values if named is row else named.sample(), saturate=True)
-            replies.append(Reply(ReplyKind.TELEMETRY, named.id, data, klass=named.klass))
+            replies.append(Reply(ReplyKind.TELEMETRY, named.id, data, message_class=named.message_class))
     return request, replies
 
 
@@ -207,7 +209,7 @@ def examine(
 
 def _check_framing(stack: SerialStack, row: Row, request: Request, line: bytes) -> None:
     """Raise IcdError if the device's end does not receive the request that the OBC's end sends."""
-    form = stack.request_formats.of(row.klass)
+    form = stack.request_formats.of(row.message_class)
     size = len(stack.request_body(request))
     if form.request_size not in (None, size):
         raise IcdError(
@@ -217,11 +219,14 @@ def _check_framing(stack: SerialStack, row: Row, request: Request, line: bytes) 
     own = isinstance(form.model, CustomFraming)
     name = f"framing {form.model.name if isinstance(form.model, CustomFraming) else form.model.kind}"
     received = guarded(name, stack.device().feed)(line, 0.0)
-    requests = [(item.klass, item.id, item.data) for item in received if isinstance(item, Request)]
-    if requests != [(row.klass, row.id, request.data)]:
-        seen = [item.detail for item in received if isinstance(item, LinkFault)]
-        seen += [f"a request for {klass} {row_id}".replace("  ", " ") for klass, row_id, _ in requests]
-        instead = "" if own else f"; it returns: {'; '.join(seen) or 'nothing'}"
+    requests = [(item.message_class, item.id, item.data) for item in received if isinstance(item, Request)]
+    if requests != [(row.message_class, row.id, request.data)]:
+        returned = [item.detail for item in received if isinstance(item, LinkFault)]
+        returned += [
+            f"a request for {message_class} {row_id}".replace("  ", " ")
+            for message_class, row_id, _ in requests
+        ]
+        instead = "" if own else f"; it returns: {'; '.join(returned) or 'nothing'}"
         raise IcdError(f"{name} does not return the request that it encoded{instead}")
 
 

@@ -1,7 +1,7 @@
-"""From the fields of a definition to the fields of a row: expanded, named, and placed in bytes one after another.
+"""Expands the fields of a definition into the fields of a row, and lays them out in bytes.
 
-One field of the definition can be several of the row: `count` and `repeat` number them, `bits` share a slot, and a
-text is short for one line of an ICD table. `TYPE NAME [UNIT] [SCALE]` is a number, `enumN NAME ENUMERATION` an
+One field of a definition may expand to several: `count` and `repeat` number them, and `bits` share a slot. A text is
+shorthand for one line of an ICD table. `TYPE NAME [UNIT] [SCALE]` is a number, `enumN NAME ENUMERATION` an
 enumeration, `bytes NAME SIZE` and `text NAME SIZE` a string, and `bits NAME[:WIDTH] …` flags and groups of bits,
 lowest first, which fill whole bytes. `-` means no name or no unit. Braces repeat the field as in a shell:
 `i16 mag{0,1}_{x,y,z} uT 0.01` is six fields, `u8 css{0..9}` is ten.
@@ -35,10 +35,9 @@ from starhil.protocol.messages import RequestKind
 
 NUMBER: Final = "[n]"
 _KINDS: Final[dict[str, FieldKind]] = {"f32": "float", "f64": "float", "bytes": "bytes", "text": "text"}
-_UNPLACED: Final = Field.model_construct(name="", kind="unused", slot=Slot(0, "u8", 0, 0))
+_FIELD_DEFAULTS: Final = Field.model_construct(name="", kind="unused", slot=Slot(0, "u8", 0, 0))
 """The defaults of a field."""
-_KEPT: Final = tuple(FieldKeys.model_fields)
-"""Keys that a field keeps as they are."""
+_KEPT_KEYS: Final = tuple(FieldKeys.model_fields)
 SMALLEST_SCALE: Final = 1e-100
 """Smallest magnitude of a scale."""
 MAX_NAMES: Final = 256
@@ -96,7 +95,7 @@ class Layout:
                 with Located(f"field {name or 'unused'}"):
                     keys = self._keys(part, slot, number)
                 keys |= {"name": name, "provenance": provenance, "shift": shift}
-                self._append(_UNPLACED.model_copy(update=keys))
+                self._append(_FIELD_DEFAULTS.model_copy(update=keys))
                 shift += keys["width"]
 
     def _slot_of(self, model: FieldModel) -> Slot:
@@ -147,7 +146,7 @@ class Layout:
         if model.name is None and (model.value or model.argument or model.const is not None):
             raise IcdError("a field with a value, argument or const needs a name")
         given = vars(model)
-        keys = {key: given[key] for key in _KEPT}
+        keys = {key: given[key] for key in _KEPT_KEYS}
         if model.const is not None:
             keys |= {"minimum": model.const, "maximum": model.const}
         return keys | {
@@ -165,11 +164,11 @@ class Layout:
         self, model: FieldModel | BitModel, limits: tuple[int, int] | None, described: str
     ) -> Iterator[str]:
         """Yield what is wrong with the parameter and the numbers of a field."""
-        name, known = model.parameter, self._icd.device_parameters
-        if name is not None and name not in known:
-            yield f"no parameter named {name!r}{did_you_mean(name, known)}"
-        elif name is not None and known[name].unit != model.unit:
-            yield f"unit {model.unit!r}, but parameter {name} is in {known[name].unit!r}; they must agree"
+        name, parameters = model.parameter, self._icd.device_parameters
+        if name is not None and name not in parameters:
+            yield f"no parameter named {name!r}{did_you_mean(name, parameters)}"
+        elif name is not None and parameters[name].unit != model.unit:
+            yield f"unit {model.unit!r}, but parameter {name} is in {parameters[name].unit!r}; they must agree"
         if abs(model.scale) < SMALLEST_SCALE:
             yield f"scale {model.scale:g} is smaller than {SMALLEST_SCALE:g}"
             return
@@ -237,12 +236,12 @@ def enum_of(name: str | None, icd: InterfaceDefinition) -> EnumDefinition:
     """Return an enumeration of the unit or, if it has none of this name, of the device model."""
     if name is None:
         raise IcdError("type enum needs `enum`, the name of an enumeration")
-    found = icd.enums.get(name) or icd.model.enums.get(name)
-    if found is None:
-        known = sorted({*icd.enums, *icd.model.enums})
-        near = did_you_mean(name, known)
-        raise MissingNameError(f"no enumeration named {name!r}{near} (known: {', '.join(known)})", name)
-    return found
+    enum = icd.enums.get(name) or icd.model.enums.get(name)
+    if enum is None:
+        names = sorted({*icd.enums, *icd.model.enums})
+        near = did_you_mean(name, names)
+        raise MissingNameError(f"no enumeration named {name!r}{near} (known: {', '.join(names)})", name)
+    return enum
 
 
 def _expanded(model: FieldModel, number: int | None) -> Iterator[tuple[FieldModel, str, int | None]]:
@@ -285,12 +284,12 @@ def mapped(table: Mapping[str, Scalar | list[Scalar]]) -> tuple[EnumDefinition, 
     """Return the enumeration of a `map`, and the values that are sent as another member."""
     values: dict[str, int] = {}
     aliases: dict[str, str] = {}
-    for wire, given in table.items():
+    for wire, targets in table.items():
         try:
             number = int(wire, 0)
         except ValueError:
             raise IcdError(f'map: {wire!r} is not a number on the wire; write "1" = "tracking"') from None
-        names = [text_of(value) for value in (given if isinstance(given, list) else [given])]
+        names = [text_of(value) for value in (targets if isinstance(targets, list) else [targets])]
         if not names or any(name in values or name in aliases for name in names):
             raise IcdError(f"map: {wire}: no value, or a duplicate one")
         values[names[0]] = number

@@ -1,9 +1,9 @@
 """Reads the interface definition of a unit from its TOML files, or lists all errors in them.
 
-The files are validated one by one (`icd_schema`). What is invalid is removed, so that the rest can still be checked,
-and the names that are missing because of that are noted: an error that another one may cause is left out. Then the
-tables of all files are put together in the order of their references: enumerations, parameters, rows, links. An
-error names file, table and key, and what to write instead.
+Each file is validated on its own (`starhil.protocol.icd.schema`). Invalid parts are dropped so that the rest can still be
+checked, and errors that may only follow from a dropped part are not reported. The tables of all files are then combined
+in order of their references: enumerations, parameters, rows, links. An error names the file, the table and the key, and
+says what to write instead.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from starhil.protocol.unit.layout import NUMBER, Layout, enum_of
 
 _Item = TypeVar("_Item")
 
-SETS: Final = "set_"
+SETTER_PREFIX: Final = "set_"
 """Prefix of the names of telecommands that can be read back."""
 HIGHEST_ID: Final = 0xFF
 """Highest ID if the link does not limit it."""
@@ -137,7 +137,6 @@ class _Reader:
     # --- files ---
 
     def _read(self, file: Path) -> None:
-        """Read and validate one file."""
         try:
             document = read_user_toml(file)
         except OSError as error:
@@ -148,17 +147,17 @@ class _Reader:
             self.errors.append(f"{file}: not valid TOML: {error}")
             self._unread = True
             return
-        said = False
+        is_reported = False
         while True:
             try:
                 tables = schema.FileModel.model_validate(document)
                 break
             except ValidationError as error:
-                found = list(problems(error, schema.FileModel, document))
-                if not said:  # later ones may be caused by what was removed
-                    self.errors += [f"{file}: {problem}" for problem in found]
-                said = True
-                places = sorted(map(_place, found), key=lambda place: [f"{step:>9}" for step in place])
+                faults = list(problems(error, schema.FileModel, document))
+                if not is_reported:  # later ones may be caused by what was removed
+                    self.errors += [f"{file}: {problem}" for problem in faults]
+                is_reported = True
+                places = sorted(map(_place, faults), key=lambda place: [f"{step:>9}" for step in place])
                 for place in reversed(dict.fromkeys(places)):  # from the last: the other indices stay
                     self._remove(file, document, place)
         for name, given in tables:
@@ -171,7 +170,7 @@ class _Reader:
         table = document[place[0]][place[1]] if len(place) > 1 else None
         name = table.get("name") if isinstance(table, dict) else None
         if isinstance(name, str):
-            self._broken |= {name, name.removeprefix(SETS)}
+            self._broken |= {name, name.removeprefix(SETTER_PREFIX)}
         if place[0] == CLASS or place == (UNIT,):
             self._broken.add(str(place[0]))
         if len(place) == 2 and place[0] in tuple(RequestKind):
@@ -284,9 +283,9 @@ class _Reader:
         _add(self._classes, item.name, item)
 
     def _add_parameter(self, model: schema.ParameterModel) -> None:
-        known, device = self._icd.parameters, self._icd.model.parameters
-        same_id = next((other.name for other in known.values() if other.id == model.id), None)
-        if same_id is not None and model.name not in known:
+        parameters, device = self._icd.parameters, self._icd.model.parameters
+        same_id = next((other.name for other in parameters.values() if other.id == model.id), None)
+        if same_id is not None and model.name not in parameters:
             raise IcdError(f"ID {model.id} is already used by {same_id}")
         if model.name not in device:
             raise IcdError(f"the device has no parameter with this name{did_you_mean(model.name, device)}")
@@ -302,7 +301,7 @@ class _Reader:
         except FieldError as error:
             raise IcdError(f"default: {error}") from None
         parameter = parameter.model_copy(update={"default": default})
-        _add(known, model.name, parameter)
+        _add(parameters, model.name, parameter)
         self._icd.device_parameters[model.name] = parameter
 
     # --- rows ---
@@ -330,8 +329,8 @@ class _Reader:
         plugin = self._icd.plugin
         if model.min_size is not None and model.action not in plugin.actions and plugin.skipped is None:
             raise IcdError("`min_size` needs a telecommand with an action of the unit's plugin")
-        if model.readback is not None and not model.name.startswith(SETS):
-            raise IcdError(f"the name of a telecommand with a readback must begin with {SETS}")
+        if model.readback is not None and not model.name.startswith(SETTER_PREFIX):
+            raise IcdError(f"the name of a telecommand with a readback must begin with {SETTER_PREFIX}")
 
     def _expand_row(self, kind: RequestKind, file: Path, model: schema.RowModel) -> None:
         where = f"{file}: {kind} {model.name}"
@@ -341,14 +340,14 @@ class _Reader:
         ids = self._ids_of(model)
         self._check_kind(kind, model)
         of_kind = [item.name for item in self._classes.values() if item.kind is kind]
-        klass = model.klass or next(iter(of_kind), "")
+        message_class = model.message_class or next(iter(of_kind), "")
         with self._recording(where):
             self._check_class(kind, model, of_kind)
         answers = model.answer
-        if klass not in self._classes:
-            klass = ""
+        if message_class not in self._classes:
+            message_class = ""
         elif answers is None:
-            answers = self._classes[klass].answer
+            answers = self._classes[message_class].answer
         single = model.last_id is None
         errors = len(self.errors)
         for number, row_id in enumerate(ids, 1):
@@ -379,8 +378,9 @@ class _Reader:
                 doc=model.doc,
                 provenance=provenance,
                 source=model.source or (self._unit.source if provenance == "confirmed" else ""),
-                klass=klass,
+                message_class=message_class,
                 action=model.action,
+                confirm=model.confirm,
                 unsolicited=model.unsolicited,
                 arguments={
                     name: number if value == NUMBER else value for name, value in model.arguments.items()
@@ -414,10 +414,10 @@ class _Reader:
 
     def _check_class(self, kind: RequestKind, model: schema.RowModel, of_kind: list[str]) -> None:
         """Raise IcdError if a row lacks its class, or names a wrong one."""
-        if model.klass is not None:
-            found = _find("class", model.klass, self._classes)
+        if model.message_class is not None:
+            found = _find("class", model.message_class, self._classes)
             if found.kind is not kind:
-                raise IcdError(f"class {model.klass} is for {found.kind}, not for {kind}")
+                raise IcdError(f"class {model.message_class} is for {found.kind}, not for {kind}")
         elif (len(of_kind) > 1 or (self._classes and not of_kind)) and CLASS not in self._broken:
             raise IcdError(f"needs `class`, one of {', '.join(of_kind or self._classes)}")
 
@@ -431,7 +431,7 @@ class _Reader:
             raise IcdError(f"ID {row.id} is above {highest}")
         if row.name in self._rows:
             raise IcdError("name used twice")
-        code = self._classes[row.klass].code if row.klass else None
+        code = self._classes[row.message_class].code if row.message_class else None
         if self._ids.setdefault((code, row.id), row.name) != row.name:
             raise IcdError(f"ID {row.id} is already used by {self._ids[code, row.id]}")
 
@@ -442,10 +442,12 @@ class _Reader:
                 continue
             name, row_id = table.get("name"), table["id"]
             of_kind = [item.name for item in self._classes.values() if item.kind is kind]
-            klass = self._classes.get(str(table.get("class", of_kind[0] if len(of_kind) == 1 else "")))
-            if self._classes and klass is None:
+            message_class = self._classes.get(
+                str(table.get("class", of_kind[0] if len(of_kind) == 1 else ""))
+            )
+            if self._classes and message_class is None:
                 continue
-            used = self._ids.get((None if klass is None else klass.code, row_id), name)
+            used = self._ids.get((None if message_class is None else message_class.code, row_id), name)
             if used != name:
                 self.errors.append(f"{file}: {kind} {name}: ID {row_id} is already used by {used}")
 
@@ -482,11 +484,11 @@ def _find(what: str, name: str, items: Mapping[str, _Item]) -> _Item:
 
 
 def _check_errors(errors: Mapping[str, int], conventions: Conventions) -> None:
-    known = [*(code.name.lower() for code in ErrorCode), OTHER_ERROR]
+    names = [*(code.name.lower() for code in ErrorCode), OTHER_ERROR]
     for name in errors:
-        if name not in known:
+        if name not in names:
             raise IcdError(
-                f"errors.{name}: no such error{did_you_mean(name, known)} (known: {', '.join(known)})"
+                f"errors.{name}: no such error{did_you_mean(name, names)} (known: {', '.join(names)})"
             )
     if "crc" in errors and not conventions.telecommand_crc:
         raise IcdError(
@@ -519,7 +521,7 @@ def _check_link(icd: InterfaceDefinition) -> None:
     stack = SerialStack(icd)
     for row in icd.rows:
         with Located(f"{row.kind} {row.name}"):
-            text_form = stack.request_formats.of(row.klass) in stack.text_formats
+            text_form = stack.request_formats.of(row.message_class) in stack.text_formats
             check_text_request(row, icd, needed=text_form)
 
 
@@ -547,7 +549,7 @@ def _readback(model: schema.RowModel) -> schema.RowModel:
     """Return the telemetry row that reports the last accepted values of a telecommand."""
     changes = {
         "id": model.readback,
-        "name": model.name.removeprefix(SETS),
+        "name": model.name.removeprefix(SETTER_PREFIX),
         "doc": "As set.",
         "include": [model.name],
     }

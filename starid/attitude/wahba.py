@@ -29,7 +29,6 @@ from starid.errors import StaridError
 
 Method = Literal["davenport", "quest", "esoq2", "foam", "svd"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
-"""Names of the estimators."""
 
 _MIN_GAP: Final = 1e-12
 """Smallest gap between the two largest eigenvalues of K (weights of sum 1) that determines roll."""

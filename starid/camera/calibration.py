@@ -59,7 +59,7 @@ _PRIOR_CENTRE: Final = 0.1
 _PRIOR_DISTORTION: Final = {"k1": 0.5, "k2": 0.5, "p1": 0.02, "p2": 0.02, "k3": 0.5}
 _MIN_STARS: Final = 2
 _HUBER: Final = 2.0
-_REJECT: Final = 5.0
+_REJECTION_SIGMAS: Final = 5.0
 _RAYLEIGH_MEDIAN: Final = 1.17741
 _SMALLEST_SCALE: Final = 1e-9
 _MAX_STEPS: Final = 60
@@ -247,7 +247,6 @@ class _Bundle:
         self.prior = (self.free_to_all.T * prior**-2.0) @ self.free_to_all
 
     def start(self) -> _State:
-        """The start values."""
         attitudes = tuple(
             solve_wahba(self.camera.back_project(f.xy_px), f.reference) if f.attitude is None else f.attitude
             for f in self.frames
@@ -283,7 +282,7 @@ class _Bundle:
     def reject(self, state: _State) -> None:
         """Reject stars beyond five times the spread."""
         distances = self.distances(self.residuals(state))
-        limit = _REJECT * self.scale(distances)
+        limit = _REJECTION_SIGMAS * self.scale(distances)
         self.used = tuple(d <= limit for d in distances)
         for number, used in enumerate(self.used, start=1):
             if used.sum() < _MIN_STARS:

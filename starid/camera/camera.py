@@ -149,22 +149,22 @@ class Camera:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Camera from the keys of `to_dict`; `fov_deg` may replace focal_px and centre_px."""
-        known = {field.name for field in dataclasses.fields(cls)}
-        unknown = sorted(set(values) - known - {"fov_deg"})
+        names = {field.name for field in dataclasses.fields(cls)}
+        unknown = sorted(set(values) - names - {"fov_deg"})
         if unknown:
             raise StaridError(
-                f"camera: unknown key {unknown[0]!r}; known are {', '.join(sorted(known | {'fov_deg'}))}"
+                f"camera: unknown key {unknown[0]!r}; known are {', '.join(sorted(names | {'fov_deg'}))}"
             )
-        given = dict(values)
-        if "fov_deg" in given:
-            clash = sorted({"focal_px", "centre_px"} & given.keys())
+        keys = dict(values)
+        if "fov_deg" in keys:
+            clash = sorted({"focal_px", "centre_px"} & keys.keys())
             if clash:
                 raise StaridError(f"camera: fov_deg and {clash[0]} exclude each other; give one")
-            return cls.from_fov(**given)
-        missing = sorted({"width", "height", "focal_px", "centre_px"} - given.keys())
+            return cls.from_fov(**keys)
+        missing = sorted({"width", "height", "focal_px", "centre_px"} - keys.keys())
         if missing:
             raise StaridError(f"camera: key {missing[0]!r} missing; set it, or fov_deg with width and height")
-        return cls(**given)
+        return cls(**keys)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values by field name, for TOML and JSON."""

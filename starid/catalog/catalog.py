@@ -182,12 +182,12 @@ class StarCatalog:
         StaridError
             A number is not in this catalogue.
         """
-        wanted = np.asarray(hip)
+        numbers = np.asarray(hip)
         ordered = self.hip[self._by_hip]
-        row = np.minimum(np.searchsorted(ordered, wanted), max(len(self) - 1, 0))
-        found = ordered[row] == wanted if len(self) else np.zeros(wanted.shape, dtype=np.bool_)
-        if not np.all(found):
-            missing = np.atleast_1d(wanted)[~np.atleast_1d(found)][0]
+        row = np.minimum(np.searchsorted(ordered, numbers), max(len(self) - 1, 0))
+        is_listed = ordered[row] == numbers if len(self) else np.zeros(numbers.shape, dtype=np.bool_)
+        if not np.all(is_listed):
+            missing = np.atleast_1d(numbers)[~np.atleast_1d(is_listed)][0]
             raise StaridError(f"star catalogue: has no HIP {missing} ({len(self)} stars)")
         return self._by_hip[row]
 
@@ -374,7 +374,7 @@ def close_pairs(ones: Array, others: Array, distance: float) -> NDArray[np.intp]
     high = np.maximum(ones[:, 0].max(initial=0.0), others[:, 0].max(initial=0.0)) + 2.0 * strip
     order, places = _in_strips(others, strip, low, high)
     first_order, middle = (order, places) if ones is others else _in_strips(ones, strip, low, high)
-    found = [np.empty((0, 2), dtype=np.intp)]
+    pairs = [np.empty((0, 2), dtype=np.intp)]
     for neighbour in (-1, 0, 1):
         centre = middle + neighbour * (high - low)
         first = np.searchsorted(places, centre - strip)
@@ -383,8 +383,8 @@ def close_pairs(ones: Array, others: Array, distance: float) -> NDArray[np.intp]
         other = order[np.arange(len(one)) + np.repeat(first - np.cumsum(count) + count, count)]
         gap = others[other] - ones[one]
         close = np.einsum("ij,ij->i", gap, gap) <= distance * distance
-        found.append(np.column_stack([one[close], other[close]]))
-    return np.concatenate(found)
+        pairs.append(np.column_stack([one[close], other[close]]))
+    return np.concatenate(pairs)
 
 
 def _in_strips(points: Array, strip: float, low: float, high: float) -> tuple[NDArray[np.intp], Array]:

@@ -52,13 +52,13 @@ def command(
     from starid.catalog import DEFAULT_EPOCH, load_catalog
 
     catalog = load_catalog(path, epoch=DEFAULT_EPOCH if epoch is None else epoch)
-    chosen = catalog if limit is None else catalog.brighter_than(limit)
+    stars = catalog if limit is None else catalog.brighter_than(limit)
     if star:
-        _show(chosen.subset(chosen.index_of(star)), rows, as_json=as_json)
+        _show(stars.subset(stars.index_of(star)), rows, as_json=as_json)
     elif cone:
-        _show(chosen.subset(chosen.in_cone(_direction(*cone[:2]), _radius(cone[2]))), rows, as_json=as_json)
+        _show(stars.subset(stars.in_cone(_direction(*cone[:2]), _radius(cone[2]))), rows, as_json=as_json)
     else:
-        _summarise(chosen, as_json=as_json)
+        _summarise(stars, as_json=as_json)
 
 
 def _direction(ra_deg: float, dec_deg: float) -> tuple[float, float, float]:

@@ -2,8 +2,8 @@
 
 A program is a table of sub-commands, each a module with a function `command` or a `group` of sub-commands. Only the
 module of the sub-command that was given is imported (all of them for the help), and these modules import slow
-packages inside their functions. Whatever a command raises of its program's errors, the system's, or for want of an
-extra of the installation ends the program with one line on stderr.
+packages inside their functions. An error of the program or of the system, or a
+missing optional dependency, ends the program with one line on stderr.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def _only_python_reads(word: str) -> bool:
     return "_" in word or not word.isascii()
 
 
-OMITTED: Final = "auto"
+OMITTED_VALUE: Final = "auto"
 """Value of an option whose metavar is in brackets (`[HOST:PORT]`) if it is given without one; typer does not support this."""
 
 
@@ -87,7 +87,7 @@ class FiniteCommand(_PlainHelp, TyperCommand):
         for argument, after in itertools.pairwise([*args, "--"]):
             whole.append(argument)
             if argument in optional and after.startswith("-"):
-                whole.append(OMITTED)
+                whole.append(OMITTED_VALUE)
         return super().parse_args(ctx, whole)
 
     def invoke(self, ctx: Any) -> Any:
@@ -199,6 +199,8 @@ def run(
         Errors whose text is one line for the user, or that have several such lines as `problems`.
     """
     show_every_character()
+    # processes of a pool would import modules of the working directory first
+    os.environ["PYTHONSAFEPATH"] = "1"
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in (
         "",
         "0",

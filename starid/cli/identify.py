@@ -212,7 +212,7 @@ def _unix_time(date: str) -> float:
         raise StaridError(f"identify --date: {error} (given: {date!r})") from None
 
 
-def _velocity(unix_s: float | None, given: str | None) -> NDArray[np.float64] | None:
+def _velocity(unix_s: float | None, text: str | None) -> NDArray[np.float64] | None:
     """Return the barycentric velocity of the camera, m/s; None if neither date nor velocity is given."""
     import numpy as np
 
@@ -220,13 +220,13 @@ def _velocity(unix_s: float | None, given: str | None) -> NDArray[np.float64] | 
     from starid.storage.files import read_number
 
     velocity: NDArray[np.float64] | None = None if unix_s is None else earth_velocity(unix_s)
-    if given is None:
+    if text is None:
         return velocity
     try:
-        x, y, z = (read_number(part) for part in given.split(","))
+        x, y, z = (read_number(part) for part in text.split(","))
     except ValueError:
         raise StaridError(
-            f"identify --observer-velocity: must be three numbers in m/s as X,Y,Z, not {given!r}"
+            f"identify --observer-velocity: must be three numbers in m/s as X,Y,Z, not {text!r}"
         ) from None
     own = np.array([x, y, z])
     return own if velocity is None else velocity + own
@@ -248,12 +248,12 @@ def _camera(profile: str | None) -> Camera:
 
 def _advice(result: ImageSolution, fov: str | None, model: str, time_limit_s: float) -> str:
     """Return a suggestion for an image that was not identified; empty if it was identified."""
-    solution, found = result.solution, result.detections
+    solution, detections = result.solution, result.detections
     if solution.valid:
         return ""
     if solution.reason == "too_few_stars":
-        seen = found.reason or f"only {len(found)} stars detected"
-        return f"{seen}; expose longer, or crop the image to the sky"
+        problem = detections.reason or f"only {len(detections)} stars detected"
+        return f"{problem}; expose longer, or crop the image to the sky"
     advice = _advice_on_camera(fov, model)
     return advice if result.complete else f"given up after {time_limit_s:g} s (--time-limit); {advice}"
 
@@ -275,7 +275,7 @@ def _advice_on_camera(fov: str | None, model: str) -> str:
 
 def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
     """Return the result as plain values; angles and quaternion are None if it is not valid."""
-    solution, found = result.solution, result.detections
+    solution, detections = result.solution, result.detections
     report: dict[str, Any] = {
         "image": str(image),
         "valid": solution.valid,
@@ -284,7 +284,7 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
         "mirrored": result.mirrored,
         **dict.fromkeys(("ra_deg", "dec_deg", "roll_deg", "quaternion_xyzw")),
         "stars": [],
-        "stars_detected": len(found.flux),
+        "stars_detected": len(detections.flux),
         "rms_px": None,
         "fov_deg": result.camera.fov_deg,
         **dict.fromkeys(("sigma_cross_arcsec", "sigma_roll_arcsec", "probability_false")),
@@ -298,7 +298,7 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
     from starid.identification.undetected import missing_stars
 
     attitude = solution.attitude
-    missing = missing_stars(solution, result.camera, result.stars, found.xy_px)
+    missing = missing_stars(solution, result.camera, result.stars, detections.xy_px)
     stars: list[dict[str, Any]] = [
         {
             "hip": int(hip),
@@ -311,8 +311,8 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
         for hip, v, (x, y), flux in zip(
             solution.hip,
             load_catalog().v[solution.catalog_index],
-            result.on_image(found.xy_px[solution.detection_index]),
-            found.flux[solution.detection_index],
+            result.on_image(detections.xy_px[solution.detection_index]),
+            detections.flux[solution.detection_index],
             strict=True,
         )
     ]
@@ -342,13 +342,13 @@ def _marked(pixels: Any, result: ImageSolution) -> Any:
     from starid.catalog import load_catalog
     from starid.photograph.annotation import annotate, star_label
 
-    solution, found = result.solution, result.detections
+    solution, detections = result.solution, result.detections
     v = load_catalog().v[solution.catalog_index]
     labels = [
         star_label(int(hip), float(magnitude), _NUMBERED_TO_MAGNITUDE)
         for hip, magnitude in zip(solution.hip, v, strict=True)
     ]
-    xy = result.on_image(found.xy_px)
+    xy = result.on_image(detections.xy_px)
     others = np.delete(xy, solution.detection_index, axis=0)
     return annotate(pixels, xy[solution.detection_index], labels, missed_xy_px=others)
 

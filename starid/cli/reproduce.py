@@ -49,9 +49,9 @@ def command(
     from starid.lab.experiments.runner import finished_in, run
 
     if list_only:
-        _list(as_json=as_json, known={n: (e.title, e.quick is not None) for n, e in experiments().items()})
+        _list(as_json=as_json, titles={n: (e.title, e.quick is not None) for n, e in experiments().items()})
         return
-    chosen = select(names or [], quick=quick)
+    selection = select(names or [], quick=quick)
     import_module("matplotlib")  # before the work
     prepare_folder(output, "-o")
     start = time.perf_counter()
@@ -59,7 +59,7 @@ def command(
     with Progress(*columns, console=Console(stderr=True), disable=as_json or not sys.stderr.isatty()) as bar:
         task = bar.add_task("starting", total=None)
         results = run(
-            chosen,
+            selection,
             output,
             quick=quick,
             seed=seed,
@@ -95,9 +95,9 @@ def command(
         raise typer.Exit(1)
 
 
-def _list(*, as_json: bool, known: dict[str, tuple[str, bool]]) -> None:
+def _list(*, as_json: bool, titles: dict[str, tuple[str, bool]]) -> None:
     if as_json:
-        print(json.dumps({name: {"title": title, "quick": quick} for name, (title, quick) in known.items()}))
+        print(json.dumps({name: {"title": title, "quick": quick} for name, (title, quick) in titles.items()}))
         return
-    for name, (title, quick) in known.items():
+    for name, (title, quick) in titles.items():
         print(f"{name:<24} {'quick  ' if quick else '       '}{title}")

@@ -1,1 +1,1 @@
-"""Which stars these are, and the attitude that follows."""
+"""Star identification, and the attitude that follows from it."""

@@ -69,15 +69,15 @@ def checked_detections(
     sigmas = np.ones((len(xy), 3))
     sigmas[:, 2] = 0.0
     if xy_sigma_px is not None:
-        given = _numbers(xy_sigma_px, "position errors")
-        if given.shape not in {(len(xy),), xy.shape, (len(xy), 2, 2)}:
+        errors = _numbers(xy_sigma_px, "position errors")
+        if errors.shape not in {(len(xy),), xy.shape, (len(xy), 2, 2)}:
             raise StaridError(
-                f"detections: shape of the errors of {len(xy)} positions must be (n,), (n, 2) or (n, 2, 2), not {given.shape}"
+                f"detections: shape of the errors of {len(xy)} positions must be (n,), (n, 2) or (n, 2, 2), not {errors.shape}"
             )
-        if given.ndim == 3:
-            sigmas[:] = _principal_axes(given)
+        if errors.ndim == 3:
+            sigmas[:] = _principal_axes(errors)
         else:
-            sigmas[:, :2] = given if given.ndim == 2 else given[:, None]
+            sigmas[:, :2] = errors if errors.ndim == 2 else errors[:, None]
         if not (np.isfinite(sigmas).all() and (sigmas[:, :2] > 0.0).all()):
             raise StaridError("detections: every position error must be finite and positive")
     return xy, brightness, sigmas

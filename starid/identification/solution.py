@@ -57,10 +57,15 @@ class FeatureReport:
         Normalised features of the image and of the cell.
     region_deg : float
         Side of the region of search, degrees; 0 if there was none.
-    stars, removed : int
-        Number of detections used, and of those that the false-star filter removed.
+    region_at_deg : tuple of 2 floats
+        Right ascension and declination of its centre, degrees.
+    stars : int
+        Number of detections used.
+    removed_index : tuple of int
+        Rows of the detections that the false-star filter removed.
     rotation_deg, translation_deg : float
-        Motion since the previous image: rotation about the boresight, and length of the shift; 0 if unknown.
+        Motion of the sky since the previous image: rotation about the boresight, and angle by which the boresight moved; 0
+        if unknown.
     refined : bool
         The attitude was refined and verified with matched stars; otherwise it is that of the features alone.
     """
@@ -73,11 +78,17 @@ class FeatureReport:
     observed: Five = (0.0,) * 5
     of_cell: Five = (0.0,) * 5
     region_deg: float = 0.0
+    region_at_deg: tuple[float, float] = (0.0, 0.0)
     stars: int = 0
-    removed: int = 0
+    removed_index: tuple[int, ...] = ()
     rotation_deg: float = 0.0
     translation_deg: float = 0.0
     refined: bool = False
+
+    @property
+    def removed(self) -> int:
+        """Number of detections that the false-star filter removed."""
+        return len(self.removed_index)
 
 
 def _nan(*shape: int) -> Array:

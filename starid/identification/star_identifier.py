@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any, Final, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 from numpy.typing import ArrayLike
 
@@ -12,14 +12,8 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
+from starid.identification.options import ALGORITHMS
 from starid.identification.solution import Solution
-
-ALGORITHMS: Final[dict[str, tuple[str, str]]] = {
-    "geometric": ("starid.identification.geometric.identifier", "Identifier"),
-    "lsi": ("starid.identification.thesis.lsi_identifier", "LsiIdentifier"),
-    "rsi": ("starid.identification.thesis.rsi_identifier", "RsiIdentifier"),
-}
-"""Name of an algorithm → module and class. A module is imported on first use."""
 
 
 @runtime_checkable
@@ -101,7 +95,7 @@ def make_identifier(
     catalog : StarCatalog, optional
         By default `load_catalog()`.
     **options
-        Keyword arguments of the algorithm's class.
+        Fields of the algorithm's options.
 
     Raises
     ------
@@ -110,6 +104,6 @@ def make_identifier(
     """
     if algorithm not in ALGORITHMS:
         raise StaridError(f"algorithm: must be one of {', '.join(ALGORITHMS)}, not {algorithm!r}")
-    module, name = ALGORITHMS[algorithm]
-    factory = getattr(importlib.import_module(module), name)
+    found = ALGORITHMS[algorithm]
+    factory = getattr(importlib.import_module(found.module), found.name)
     return cast("StarIdentifier", factory(camera, catalog, **options))

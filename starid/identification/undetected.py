@@ -77,18 +77,18 @@ def missing_stars(
     chosen = inside & (border > _EDGE_PX)
     near, xy = near[chosen], xy[chosen]
     detections = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
-    seen = np.isin(stars.hip[near], solution.hip)
+    is_detected = np.isin(stars.hip[near], solution.hip)
     if len(detections):
-        for row in np.flatnonzero(~seen):
+        for row in np.flatnonzero(~is_detected):
             gap = detections - xy[row]
-            seen[row] = bool(np.min(np.einsum("ij,ij->i", gap, gap)) < radius_px * radius_px)
+            is_detected[row] = bool(np.min(np.einsum("ij,ij->i", gap, gap)) < radius_px * radius_px)
     magnitude = stars.v[near]
-    limit = _complete_to(magnitude, seen)
-    lost = np.flatnonzero(~seen & (magnitude <= limit))
+    limit = _complete_to(magnitude, is_detected)
+    lost = np.flatnonzero(~is_detected & (magnitude <= limit))
     return MissingStars(stars.hip[near][lost], xy[lost], magnitude[lost], limit)
 
 
-def _complete_to(magnitude: Array, seen: Mask) -> float:
+def _complete_to(magnitude: Array, is_detected: Mask) -> float:
     """Faint end of the last complete half-magnitude bin; −inf if there is none."""
     limit = -math.inf
     if magnitude.size == 0:
@@ -96,6 +96,6 @@ def _complete_to(magnitude: Array, seen: Mask) -> float:
     bins = np.floor(magnitude / _BIN).astype(np.int64)
     for edge in range(int(bins.min()), int(bins.max()) + 1):
         inside = bins == edge
-        if inside.any() and float(seen[inside].mean()) >= COMPLETE_TO:
+        if inside.any() and float(is_detected[inside].mean()) >= COMPLETE_TO:
             limit = (edge + 1) * _BIN
     return limit

@@ -145,21 +145,21 @@ def _block_statistics(image: GreyImage, block: int, level: Array32, noise: Array
                     values[count + x] = np.float32(line[x])
                 count += columns
             step = max(count // _FIRST_SAMPLES, 1)
-            chosen = min(count // step, _FIRST_SAMPLES)
-            for k in range(chosen):
+            sample_size = min(count // step, _FIRST_SAMPLES)
+            for k in range(sample_size):
                 key = np.int32(values[k * step])
                 j = k - 1
                 while j >= 0 and first[j] > key:
                     first[j + 1] = first[j]
                     j -= 1
                 first[j + 1] = key
-            spread = (first[(3 * chosen) // 4] - first[chosen // 4]) / _QUARTILE_SIGMA
+            spread = (first[(3 * sample_size) // 4] - first[sample_size // 4]) / _QUARTILE_SIGMA
             rows = count // columns
             if laid != (columns, rows):
                 laid = (columns, rows)
                 _offsets(columns, 1.0, dx)
                 _offsets(rows, _ROW_STEP, dy)
-            start = (float(first[chosen // 2]), max(spread, 0.5))
+            start = (float(first[sample_size // 2]), max(spread, 0.5))
             _refine(values[:count], dx[:columns], dy[:rows], start, plane)
             # from the centre of the sampled pixels to the centre of the block on the grid
             first_row = top + column % _ROW_STEP

@@ -28,12 +28,12 @@ from starid.imaging.matched_filter import (
     spot_taps,
 )
 from starid.imaging.measurement import (
-    AGAIN,
     AT_EDGE,
     BAD_FIT,
+    FIRST_ROUNDS,
     FIT_PARAMETERS,
-    FRESH,
     NOT_A_STAR,
+    REFIT_ROUNDS,
     SATURATED,
     TWICE,
     find_neighbours,
@@ -65,7 +65,7 @@ Table: TypeAlias = Array
 MIN_SIDE_PX: Final = 16
 _ASSUMED_SIGMA_PX: Final = 0.9
 _MAX_PEAKS: Final = 8192
-_HIGHER: Final = 1.5
+_THRESHOLD_STEP: Final = 1.5
 _STARS_FOR_A_GLANCE: Final = 12
 _STARS_FOR_SHAPE: Final = 30
 _PEAKS_FOR_TRAILS: Final = 300
@@ -77,7 +77,7 @@ _MIN_FOR_WIDTH: Final = 3
 _TRAIL_FILTER_PX: Final = 1.5
 _OTHER_WIDTH: Final = 0.3
 _MISFIT_SIGMA: Final = 3.0
-_RELAX: Final = 0.8
+_RELAXED_SHARE: Final = 0.8
 _MAX_NEIGHBOURS: Final = 64
 _TRAIL_ERROR: Final = 4e-4
 """Error along a trail, as a share of its length, that its model leaves."""
@@ -295,22 +295,24 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
     StaridError
         The image has an unsupported type or shape.
     """
-    chosen = DetectionSettings() if settings is None else settings
+    options = DetectionSettings() if settings is None else settings
     counts = _checked_image(image)
-    saturation = chosen.saturation_dn if chosen.saturation_dn is not None else int(np.iinfo(counts.dtype).max)
-    background = estimate_background(counts, chosen.block_px)
+    saturation = (
+        options.saturation_dn if options.saturation_dn is not None else int(np.iinfo(counts.dtype).max)
+    )
+    background = estimate_background(counts, options.block_px)
     if background.median_level >= saturation:
         found = _no_detections(background, "image is saturated all over: shorten the exposure")
         return dataclasses.replace(found, searchable=False)
-    sigma = chosen.psf_sigma_px if chosen.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
-    scene = _Scene(counts, background, chosen, float(saturation))
+    sigma = options.psf_sigma_px if options.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
+    scene = _Scene(counts, background, options, float(saturation))
     peaks, heights = _peaks(scene, sigma)
     shape = _estimate_shape(scene, peaks)
-    if chosen.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
+    if options.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
         peaks, heights = _peaks(scene, shape.sigma_px)
         shape = _estimate_shape(scene, peaks, shape.sigma_px)
     peaks, heights, hot = _without_hot_pixels(scene, peaks, heights, shape.sigma_px)
-    unsure = chosen.follow_trails and shape.trail_px == 0.0
+    unsure = options.follow_trails and shape.trail_px == 0.0
     if unsure and len(hot) > len(peaks):
         shape = _trails_among_round(scene, peaks, shape)
         unsure = False
@@ -344,7 +346,6 @@ def _checked_image(image: npt.NDArray[np.generic]) -> GreyImage:
 
 
 def _no_detections(background: Background, reason: str, rejected: int = 0) -> Detections:
-    """Return empty detections with a reason."""
     none = np.zeros(0)
     pairs = np.zeros((0, 2))
     no = np.zeros(0, dtype=bool)
@@ -414,7 +415,7 @@ def _search(
         count = search(threshold, peaks, heights)
         if count < _MAX_PEAKS:
             break
-        factor *= _HIGHER
+        factor *= _THRESHOLD_STEP
     peaks, heights = peaks[:count], heights[:count]
     rows, columns = background.level.shape
     blocks = peaks // background.block_px
@@ -430,13 +431,13 @@ def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float = _ASSUMED_S
     start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
     tries = peaks[: 4 * _STARS_FOR_SHAPE]
     # a few stars show whether there are trails at all; more are needed only to follow them
-    for wanted in (_STARS_FOR_A_GLANCE, _STARS_FOR_SHAPE):
-        table = np.empty((wanted, MOMENT_COLUMNS))
+    for star_count in (_STARS_FOR_A_GLANCE, _STARS_FOR_SHAPE):
+        table = np.empty((star_count, MOMENT_COLUMNS))
         count = moments_of(
             scene.counts, tries, *scene.level, start, _SHAPE_WINDOW_PX, scene.saturation, table
         )
         shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
-        if shape.trail_px == 0.0 or count < wanted:
+        if shape.trail_px == 0.0 or count < star_count:
             break
     if settings.psf_sigma_px is None and shape.trail_px == 0.0:
         widths = np.empty(_STARS_FOR_WIDTH)
@@ -472,7 +473,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
     first = np.empty(count + 1, dtype=np.int32)
     neighbours = np.empty(_MAX_NEIGHBOURS * count, dtype=np.int32)
     find_neighbours(windows, np.argsort(windows["start_y"]), first, neighbours)
-    ratio = _RELAX * settings.threshold_sigma
+    ratio = _RELAXED_SHARE * settings.threshold_sigma
     stars = np.zeros(count, FIT)
     stars["state"] = NO_FIT
     fits = _Fits(
@@ -486,7 +487,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
         stars,
         np.zeros(count, dtype=np.uint8),
     )
-    fits.measure(np.ones(count, dtype=bool), FRESH)
+    fits.measure(np.ones(count, dtype=bool), FIRST_ROUNDS)
     return fits
 
 
@@ -499,15 +500,15 @@ def _with_companions(fits: _Fits, blend_px: float) -> _Fits:
     suspects = np.flatnonzero(bad & ((fits.flags & SATURATED) == 0))
     partners, owners = np.empty(len(suspects), FIT), np.empty(len(suspects), dtype=np.int64)
     near = (fits.first, fits.neighbours)
-    found = split_pairs(
+    pair_count = split_pairs(
         fits.windows, fits.pixels, *near, fits.sensor[:3], stars, suspects, blend_px, partners, owners, bad
     )
-    fits.measure(bad, AGAIN)
-    owners = owners[:found]
+    fits.measure(bad, REFIT_ROUNDS)
+    owners = owners[:pair_count]
     return dataclasses.replace(
         fits,
         windows=np.concatenate([fits.windows, fits.windows[owners]]),
-        stars=np.concatenate([stars, partners[:found]]),
+        stars=np.concatenate([stars, partners[:pair_count]]),
         flags=np.concatenate([fits.flags, fits.flags[owners]]),
     )
 

@@ -29,14 +29,14 @@ from starid.kernels.small_arrays import copy_values
 SATURATED, AT_EDGE = 1, 2
 """Bits of a star's flags."""
 
-FRESH: Final = (0, 3)
-AGAIN: Final = (1, 4)
+FIRST_ROUNDS: Final = (0, 3)
+REFIT_ROUNDS: Final = (1, 4)
 """First and last round of `measure`: starting from the candidates, or from existing fits."""
 
 NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 5, 6, 7, 8
 """Reasons to reject a candidate, in addition to those of `starid.imaging.centroid`."""
 
-_HOPELESS: Final = 0.6
+_HOPELESS_SHARE: Final = 0.6
 """Share of the least signal of a star below which a first guess is not fitted."""
 
 _MIN_EXPLAINED: Final = 0.55
@@ -269,7 +269,7 @@ def measure(
     todo : ndarray (n,) of bool
         The candidates to fit; the fits of the others are kept.
     turns : (int, int)
-        First and last round: `FRESH`, or `AGAIN` to continue from existing fits. In the last round a fit that is still bad is
+        First and last round: `FIRST_ROUNDS`, or `REFIT_ROUNDS` to continue from existing fits. In the last round a fit that is still bad is
         repeated without the pixel that contradicts it most.
     stars : ndarray (n,) of FIT
         Filled; `state` is NO_FIT before the first round.
@@ -310,7 +310,7 @@ def measure(
                     _subtract_star(stars[neighbours[entry]], shape, bounds, lights, work, target)
             noise = (window.noise * window.noise, per_dn, model_error)
             guess = (star.x, star.y) if turn > 0 else (window.start_x, window.start_y)
-            least = _HOPELESS * least_ratio * window.noise if turn == 0 and window.patch == 0.0 else 0.0
+            least = _HOPELESS_SHARE * least_ratio * window.noise if turn == 0 and window.patch == 0.0 else 0.0
             fit_star(target, bounds, guess, shape, noise, least, model, work, star)
             if (
                 last

@@ -338,7 +338,7 @@ def split_pairs(
     cleaned = np.empty(largest, np.float32)
     left_over = np.empty(largest)
     pair = np.empty_like(stars[:1].repeat(2))
-    found = 0
+    pair_count = 0
     for k in suspects:
         window: Window = windows[k]
         star: Fit = stars[k]
@@ -370,7 +370,7 @@ def split_pairs(
             _merge(pair, blend_px, star)
             continue
         stars[k] = pair[1 - faint]
-        partners[found] = pair[faint]
-        owners[found] = k
-        found += 1
-    return found
+        partners[pair_count] = pair[faint]
+        owners[pair_count] = k
+        pair_count += 1
+    return pair_count

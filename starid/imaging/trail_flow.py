@@ -36,7 +36,6 @@ _SHARE_REACH: Final = 6.0
 
 @compiled_ieee
 def _flow_trail(flow: Array, u: float, v: float) -> tuple[float, float]:
-    """Trail of a flow at a position."""
     inward = flow[3] * u + flow[4] * v
     return flow[0] + u * inward - flow[2] * v, flow[1] + v * inward + flow[2] * u
 

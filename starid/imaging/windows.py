@@ -146,18 +146,18 @@ def _saturated_patch(
     x: int,
     y: int,
     saturation: float,
-    seen: npt.NDArray[np.uint8],
+    visited: npt.NDArray[np.uint8],
     stack: Indices32,
     patch: Array,
 ) -> bool:
     """Follow the connected saturated pixels from (x, y); False if they are too many or too far for a star.
 
     Fills `patch` (7,) with their mean column and row, half their larger extent, and their first and last column and
-    row. `seen` is workspace of (2·PATCH_REACH + 1)².
+    row. `visited` is workspace of (2·PATCH_REACH + 1)².
     """
     height, width = image.shape
-    seen[:] = 0
-    seen[PATCH_REACH, PATCH_REACH] = 1
+    visited[:] = 0
+    visited[PATCH_REACH, PATCH_REACH] = 1
     stack[0, 0], stack[0, 1] = x, y
     waiting, count = 1, 0
     total_x = total_y = 0.0
@@ -175,8 +175,8 @@ def _saturated_patch(
         for b in range(max(row - 1, 0), min(row + 2, height)):
             for a in range(max(column - 1, 0), min(column + 2, width)):
                 i, j = a - x + PATCH_REACH, b - y + PATCH_REACH
-                if seen[j, i] == 0 and image[b, a] >= saturation and waiting < stack.shape[0]:
-                    seen[j, i] = 1
+                if visited[j, i] == 0 and image[b, a] >= saturation and waiting < stack.shape[0]:
+                    visited[j, i] = 1
                     stack[waiting, 0], stack[waiting, 1] = a, b
                     waiting += 1
     patch[0], patch[1] = total_x / count, total_y / count
@@ -300,7 +300,7 @@ def lay_windows(
     for k in range(_RING_PIXELS):
         circle[0, k] = math.cos(2.0 * math.pi * k / _RING_PIXELS)
         circle[1, k] = math.sin(2.0 * math.pi * k / _RING_PIXELS)
-    seen = np.empty((2 * PATCH_REACH + 1, 2 * PATCH_REACH + 1), np.uint8)
+    visited = np.empty((2 * PATCH_REACH + 1, 2 * PATCH_REACH + 1), np.uint8)
     stack = np.empty((2 * MAX_SATURATED, 2), np.int32)
     patches = np.empty((_MAX_PATCHES, 7))
     patch_count = 0
@@ -314,7 +314,7 @@ def lay_windows(
             if _in_patches(column, row, patches, patch_count):
                 window.columns = SEEN_BEFORE
                 continue
-            if not _saturated_patch(image, column, row, saturation, seen, stack, patch):
+            if not _saturated_patch(image, column, row, saturation, visited, stack, patch):
                 window.columns = EXTENDED
                 continue
             patch_count = min(patch_count + 1, _MAX_PATCHES - 1)

@@ -166,11 +166,11 @@ class RoughSearch:
             search = self._first.with_camera(plain, fov_tolerance=self._tolerance, effort=attempt.effort)
             solution = search.identify(positions[rows], brightness[rows])
             if solution.valid:
-                found = solution.camera or plain
+                camera = solution.camera or plain
                 solution = dataclasses.replace(
                     solution,
                     detection_index=rows[solution.detection_index].astype(np.int64),
-                    camera=scaled_camera(lens, found.focal_px[0] / plain.focal_px[0]),
+                    camera=scaled_camera(lens, camera.focal_px[0] / plain.focal_px[0]),
                 )
             late = time.perf_counter() - begin > time_limit_s
             if solution.valid or solution.reason is Reason.TOO_FEW_STARS or late:
@@ -178,7 +178,6 @@ class RoughSearch:
         return solution.timed(begin)
 
     def _attempts(self, xy: Array, flux: Array, rounds: Sequence[int]) -> Iterator[_Attempt]:
-        """Yield the attempts of some rounds."""
         brightest = np.argsort(-flux, kind="stable")
         known_lens = any(self._first.camera.distortion)
         for number in rounds:

@@ -189,20 +189,20 @@ def calibrate_identified(
     bright = sky.brighter_than(faintest + _MAGNITUDE_MARGIN)
     reach = result.camera.field_radius_rad * _FIELD_MARGIN
     fields = [bright.in_cone(attitude.boresight, reach) for attitude in result.attitudes]
-    seen = merge_close_stars(
+    references = merge_close_stars(
         bright.subset(np.unique(np.concatenate(fields))), _BLEND_PX * camera.pixel_scale_rad
     )
     matches: tuple[Indices, ...] = ()
     for _ in range(_ROUNDS):
         pairs = [
-            _paired(frames[index], result.camera, attitude, seen, result.sigma_px)
+            _paired(frames[index], result.camera, attitude, references, result.sigma_px)
             for index, attitude in zip(indices, result.attitudes, strict=True)
         ]
         again = [
-            _frame(frames[index], _floored_sigma(frames[index]), chosen, seen.vectors[rows], attitude)
+            _frame(frames[index], _floored_sigma(frames[index]), chosen, references.vectors[rows], attitude)
             for index, attitude, (chosen, rows) in zip(indices, result.attitudes, pairs, strict=True)
         ]
-        matches = tuple(np.stack([chosen, seen.hip[rows]], axis=1) for chosen, rows in pairs)
+        matches = tuple(np.stack([chosen, references.hip[rows]], axis=1) for chosen, rows in pairs)
         before = result
         start = dataclasses.replace(camera, focal_px=result.camera.focal_px)
         result = _best(again, start, models) if estimate is None else calibrate(again, start, estimate)
@@ -220,12 +220,12 @@ def _floored_sigma(stars: Stars) -> Array | None:
 
 
 def _frame(
-    stars: Stars, sigma: Array | None, chosen: Indices, reference: Array, attitude: Attitude
+    stars: Stars, sigma: Array | None, rows: Indices, reference: Array, attitude: Attitude
 ) -> CalibrationFrame:
     return CalibrationFrame(
-        xy_px=np.asarray(stars.xy_px)[chosen],
+        xy_px=np.asarray(stars.xy_px)[rows],
         reference=reference,
-        sigma_px=None if sigma is None else sigma[chosen],
+        sigma_px=None if sigma is None else sigma[rows],
         attitude=attitude,
     )
 
@@ -283,16 +283,16 @@ def _calibrations(
 ) -> Iterator[tuple[tuple[str, ...], Calibration]]:
     """Calibrate with each model and yield the successes; raise the last error if all fail."""
     last_error: StaridError | None = None
-    held = 0
+    count = 0
     for model in models:
         try:
             result = calibrate(frames, camera, model)
         except StaridError as error:
             last_error = error
             continue
-        held += 1
+        count += 1
         yield model, result
-    if last_error is not None and held == 0:
+    if last_error is not None and count == 0:
         raise last_error
 
 

@@ -123,13 +123,13 @@ def solve_image(
         return search_views(
             views(image, settings), [nominal], search_for, observer_velocity, time_limit_s, progress
         )
-    found = detect(image, settings or DetectionSettings())
+    detections = detect(image, settings or DetectionSettings())
     identifier = Identifier(nominal, sky)
     solution = identifier.identify(
-        found.xy_px, found.flux, found.xy_sigma_px, observer_velocity=observer_velocity
+        detections.xy_px, detections.flux, detections.xy_sigma_px, observer_velocity=observer_velocity
     )
     stars = identifier.stars.aberrated(observer_velocity)
-    return ImageSolution(solution, found, solution.camera or nominal, stars)
+    return ImageSolution(solution, detections, solution.camera or nominal, stars)
 
 
 def search_views(
@@ -227,32 +227,36 @@ def refine_solution(
         See `starid.identification.star_identifier.StarIdentifier.identify`.
     """
     identifier = search.identifier
-    found = view.detections
+    detections = view.detections
     if view.mirrored:
-        found = dataclasses.replace(found, xy_px=flipped(found.xy_px, camera.width))
+        detections = dataclasses.replace(detections, xy_px=flipped(detections.xy_px, camera.width))
     refined = solution.camera or camera
     if solution.star_count >= _FEW:
-        stars = Stars(found.xy_px, found.flux, found.xy_sigma_px)
+        stars = Stars(detections.xy_px, detections.flux, detections.xy_sigma_px)
         refined = _refined(stars, solution, refined, camera, identifier.catalog.aberrated(observer_velocity))
     again = identifier.with_camera(refined).track(
-        found.xy_px, found.flux, solution.attitude, found.xy_sigma_px, observer_velocity=observer_velocity
+        detections.xy_px,
+        detections.flux,
+        solution.attitude,
+        detections.xy_sigma_px,
+        observer_velocity=observer_velocity,
     )
     if again.valid:
         solution = dataclasses.replace(again, mode="lost_in_space", camera=refined)
     solution = solution.timed(begin)
     seen = identifier.stars.aberrated(observer_velocity)
-    return ImageSolution(solution, found, solution.camera or camera, seen, view.mirrored)
+    return ImageSolution(solution, detections, solution.camera or camera, seen, view.mirrored)
 
 
 def _refined(
-    stars: Stars, solution: Solution, found: Camera, nominal: Camera, catalog: StarCatalog
+    stars: Stars, solution: Solution, camera: Camera, nominal: Camera, catalog: StarCatalog
 ) -> Camera:
-    """Calibrate the camera on an identified image; return `found` if that fails."""
+    """Calibrate the camera on an identified image; return `camera` if that fails."""
     try:
         outcome = calibrate_identified([stars], {0: solution}, nominal, catalog, models=IMAGE_MODELS)
     except StaridError as error:
         _log.info("lens not calibrated: %s", error)
-        return found
+        return camera
     return outcome.calibration.camera
 
 

@@ -58,18 +58,18 @@ def views(image: GreyImage, settings: DetectionSettings | None = None) -> Iterat
     settings : DetectionSettings, optional
         Settings of the detection; by default `max_stars` is `MAX_STARS`.
     """
-    chosen = settings or DetectionSettings(max_stars=MAX_STARS)
-    upright = [_detect(image, chosen)]
+    options = settings or DetectionSettings(max_stars=MAX_STARS)
+    upright = [_detect(image, options)]
     yield View(upright[0])
     clean = without_speckles(image, upright[0].noise)
     if clean is not None:
-        upright.append(_detect(clean, chosen))
+        upright.append(_detect(clean, options))
         yield View(upright[1])
     if has_dark_tail(image):
-        yield View(_detect(np.invert(image), chosen))
+        yield View(_detect(np.invert(image), options))
     for factor in FACTORS:
         if min(image.shape) >= factor * MIN_SIDE_PX:
-            yield View(_coarser(image if clean is None else clean, factor, chosen))
+            yield View(_coarser(image if clean is None else clean, factor, options))
     for found in upright:
         yield View(found, mirrored=True)
 
@@ -146,15 +146,15 @@ def _coarser(image: GreyImage, factor: int, settings: DetectionSettings) -> Dete
     blocks = image[:height, :width].reshape(height // factor, factor, width // factor, factor)
     mean = blocks.mean(axis=(1, 3), dtype=np.float64)
     finer = 65535.0 / float(np.iinfo(image.dtype).max)
-    found = _detect(np.rint(mean * finer).astype(np.uint16), settings)
+    detections = _detect(np.rint(mean * finer).astype(np.uint16), settings)
     return dataclasses.replace(
-        found,
-        xy_px=found.xy_px * factor + 0.5 * (factor - 1),
-        flux=found.flux * (factor**2 / finer),
-        flux_sigma=found.flux_sigma * (factor**2 / finer),
-        xy_sigma_px=found.xy_sigma_px * factor,
-        background=found.background / finer,
-        noise=found.noise * (factor / finer),
-        psf_sigma_px=found.psf_sigma_px * factor,
-        trail_px=found.trail_px * factor,
+        detections,
+        xy_px=detections.xy_px * factor + 0.5 * (factor - 1),
+        flux=detections.flux * (factor**2 / finer),
+        flux_sigma=detections.flux_sigma * (factor**2 / finer),
+        xy_sigma_px=detections.xy_sigma_px * factor,
+        background=detections.background / finer,
+        noise=detections.noise * (factor / finer),
+        psf_sigma_px=detections.psf_sigma_px * factor,
+        trail_px=detections.trail_px * factor,
     )

@@ -188,7 +188,7 @@ def _name(path: Path) -> str:
 
 def cached_files() -> list[CachedFile]:
     """Return the cached files, least recently used first."""
-    found = []
+    files = []
     folder = cache_dir()
     for path in (*folder.glob("*"), *folder.glob(f"{_KERNELS}/*")):
         if _OWN_NAME.fullmatch(_name(path)):
@@ -197,8 +197,8 @@ def cached_files() -> list[CachedFile]:
                 size = _size_of_folder(path) if path.is_dir() else state.st_size
             except OSError:  # another process has removed it, or it is a link to nowhere
                 continue
-            found.append(CachedFile(path, size, state.st_mtime))
-    return sorted(found, key=lambda each: each.used_s)
+            files.append(CachedFile(path, size, state.st_mtime))
+    return sorted(files, key=lambda each: each.used_s)
 
 
 def _size_of_folder(folder: Path) -> int:

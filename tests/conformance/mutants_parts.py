@@ -26,8 +26,8 @@ def boots_not_counted(unit: SimulatedUnit) -> None:
 def stale_attitude(unit: SimulatedUnit) -> None:
     original = unit.requests.telemetry
 
-    def changed(name: str, shot: Snapshot) -> bytes:
-        data = bytearray(original(name, shot))
+    def changed(name: str, snapshot: Snapshot) -> bytes:
+        data = bytearray(original(name, snapshot))
         if name == "precise_attitude":
             field = unit.device.icd.telemetry[name].named_fields["valid"]
             data[field.offset] |= 1 << field.shift
@@ -48,8 +48,8 @@ def _telemetry_bytes(name: str, field: str, change: Callable[[bytes], bytes]) ->
         original = unit.requests.telemetry
         item = unit.device.icd.telemetry[name].named_fields[field]
 
-        def changed(asked: str, shot: Snapshot) -> bytes:
-            data = original(asked, shot)
+        def changed(asked: str, snapshot: Snapshot) -> bytes:
+            data = original(asked, snapshot)
             if asked != name:
                 return data
             end = item.offset + item.size

@@ -33,11 +33,11 @@ def stack_of(unit: SimulatedUnit) -> SerialStack:
     return stack
 
 
-def bodies(change: Callable[[bytes, SerialStack], bytes], klass: str = "") -> Damage:
+def bodies(change: Callable[[bytes, SerialStack], bytes], message_class: str = "") -> Damage:
     """Change the bodies of the frames that the device sends, in the format of a class."""
 
     def damage(unit: SimulatedUnit) -> None:
-        framing = stack_of(unit).reply_formats.of(klass).framing
+        framing = stack_of(unit).reply_formats.of(message_class).framing
         encode = framing.encode
         framing.encode = lambda body: encode(change(body, stack_of(unit)))  # type: ignore[method-assign]
 
@@ -67,7 +67,7 @@ def telemetry_data(change: Callable[[bytes, Row], bytes]) -> Damage:
     """Change the data of telemetry."""
 
     def changed(reply: Reply, device: Device) -> Reply:
-        row = device.icd.row(reply.id or 0, reply.klass)
+        row = device.icd.row(reply.id or 0, reply.message_class)
         if reply.kind is not ReplyKind.TELEMETRY or row is None or not reply.data:
             return reply
         return dataclasses.replace(reply, data=change(reply.data, row))
@@ -173,20 +173,22 @@ def twice(data: bytes) -> list[bytes]:
 
 
 def class_changed(reply: Reply, device: Device) -> Reply:
-    other = {"telemetry": "parameter", "parameter": "telemetry"}.get(reply.klass, reply.klass)
-    return dataclasses.replace(reply, klass=other)
+    other = {"telemetry": "parameter", "parameter": "telemetry"}.get(reply.message_class, reply.message_class)
+    return dataclasses.replace(reply, message_class=other)
 
 
 def subscription_deaf(
     _device: Device, request: Request, handle: Callable[[Request], list[Reply]]
 ) -> list[Reply]:
-    if (request.klass, request.id) == ("set", 18) and not any(request.data):
-        return [Reply(ReplyKind.ACK, request.id, klass=request.klass, destination=request.source)]
+    if (request.message_class, request.id) == ("set", 18) and not any(request.data):
+        return [
+            Reply(ReplyKind.ACK, request.id, message_class=request.message_class, destination=request.source)
+        ]
     return handle(request)
 
 
 def cut_to_size(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
-    row = device.icd.row(request.id, request.klass)
+    row = device.icd.row(request.id, request.message_class)
     size = row.size if row is not None and row.kind == "telecommand" else 0
     return handle(dataclasses.replace(request, data=request.data[:size].ljust(size, b"\0")))
 
@@ -201,16 +203,20 @@ def without_limits(device: Device, request: Request, handle: Callable[[Request],
 
 
 def clock_stays(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
-    if (request.klass, request.id) == ("action", 14):
-        return [Reply(ReplyKind.ACK, request.id, klass=request.klass, destination=request.source)]
+    if (request.message_class, request.id) == ("action", 14):
+        return [
+            Reply(ReplyKind.ACK, request.id, message_class=request.message_class, destination=request.source)
+        ]
     return handle(request)
 
 
 def setting_forgotten(
     device: Device, request: Request, handle: Callable[[Request], list[Reply]]
 ) -> list[Reply]:
-    if (request.klass, request.id) == ("set", 9):
-        return [Reply(ReplyKind.ACK, request.id, klass=request.klass, destination=request.source)]
+    if (request.message_class, request.id) == ("set", 9):
+        return [
+            Reply(ReplyKind.ACK, request.id, message_class=request.message_class, destination=request.source)
+        ]
     return handle(request)
 
 
@@ -251,7 +257,7 @@ def conjugated(data: bytes, row: Row) -> bytes:
 
 def ping_answered(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
     found = handle(request)
-    return found or [Reply(ReplyKind.ACK, request.id, klass=request.klass)]
+    return found or [Reply(ReplyKind.ACK, request.id, message_class=request.message_class)]
 
 
 def st200() -> Iterator[UnitMutant]:
@@ -438,6 +444,6 @@ def _as_replies(unit: SimulatedUnit) -> None:
 
 
 def _answers_all(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
-    if device.icd.row(request.id, request.klass) is not None:
+    if device.icd.row(request.id, request.message_class) is not None:
         return handle(request)
-    return [Reply(ReplyKind.TELEMETRY, request.id, bytes(4), klass=request.klass)]
+    return [Reply(ReplyKind.TELEMETRY, request.id, bytes(4), message_class=request.message_class)]

@@ -8,9 +8,9 @@ importers share. A function or a text that no longer exists raises `LostAimError
 from __future__ import annotations
 
 import functools
-import gc
 import importlib
 import inspect
+import sys
 import textwrap
 import tomllib
 import types
@@ -151,6 +151,7 @@ def _mutated(function: types.FunctionType, edit: Edit) -> types.CodeType:
 
 def _forget() -> None:
     """Clear what the product has computed once, such as the definitions of units and tables of checks."""
-    for item in gc.get_objects():
-        if type(item) is functools._lru_cache_wrapper and (item.__module__ or "").startswith("starhil."):
+    modules = [module for name, module in sys.modules.items() if name.startswith("starhil.")]
+    for item in {id(item): item for module in modules for item in vars(module).values()}.values():
+        if isinstance(item, functools._lru_cache_wrapper):
             item.cache_clear()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from pathlib import Path
 
 import pytest
@@ -304,13 +303,15 @@ def test_a_pause_begins_when_the_line_is_free(tmp_path):
     assert probe.now() >= 1.0 + unit.serial.timeout
 
 
-def test_the_seconds_of_a_failed_case_include_its_recovery(tmp_path):
+def test_the_seconds_of_a_failed_case_include_its_recovery(tmp_path, monkeypatch):
+    clock = [0.0]
+    monkeypatch.setattr("starhil.hil_tests.conformance.runner.time.perf_counter", lambda: clock[0])
     with SimulatedUnit("serial", unit=write_unit(tmp_path, "sum")) as simulated:
-        simulated.probe.recover = lambda: time.sleep(0.05)
+        simulated.probe.recover = lambda: clock.__setitem__(0, 9.0)
         outcome = run_case(
             simulated.probe, Case("a.b.c", "a.b", "t", "c", lambda _probe: check(None, "so", "not so"))
         )
-    assert outcome.seconds >= 0.05
+    assert outcome.seconds == 9.0
 
 
 PARAMETERS = """

@@ -1,4 +1,4 @@
-"""Files `*_cases.toml` of a unit add cases on CANopen; an error in one is located."""
+"""Files `*_cases.toml` of a unit add cases in one language for all links; an error in one is located."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from starhil.hil_tests.conformance.canopen_dialogue import dialogue_cases
+from starhil.hil_tests.conformance.canopen_dialogue import CanopenDialogue, dialogue_cases
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, canopen_suite
+from starhil.hil_tests.conformance.case_file import text_cases
+from starhil.hil_tests.conformance.dialogue import LinkDialogue
 from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.judge.definition import read_unit
@@ -106,12 +108,49 @@ def test_the_lines_after_finally_are_held_after_a_failure_which_is_reported(tmp_
     assert outcome.seen == "555"
 
 
+@pytest.mark.parametrize("link", ["serial", "can", "canopen"])
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ("command clear_counters; telemetry identification node_type=0x53 interface_version=1", ""),
+        ("telemetry identification node_type=84", "identification {'node_type': 84}"),
+        ("telemetry nothing a=1", "telemetry 'nothing' in the definition"),
+        ("command nothing", "a telecommand 'nothing' in the definition"),
+    ],
+)
+def test_rows_by_name_are_steps_on_each_link(lines: str, expected: str, link: str, tmp_path: Path) -> None:
+    path = case_file(tmp_path, lines)
+    path.write_text(path.read_text().replace('"canopen"', f'"{link}"').replace("need 1017", "drain"))
+    dialogue = CanopenDialogue if link == "canopen" else LinkDialogue
+    (case,) = text_cases(path, link, {}, dialogue)
+    with SimulatedUnit(link) as simulated:
+        outcome = run_case(simulated.probe, case)
+    assert outcome.status == ("failed" if expected else "passed"), outcome
+    assert outcome.expected.startswith(expected)
+
+
+def test_steps_after_finally_follow_a_failure_on_a_serial_line_too(tmp_path: Path) -> None:
+    path = case_file(tmp_path, "1F 7F 80 1F FF > 129; finally; 1F 7F 81 1F FF > 129  # the row asked for")
+    path.write_text(path.read_text().replace('"canopen"', '"serial"').replace("need 1017", "drain"))
+    (case,) = text_cases(path, "serial", {})
+    with SimulatedUnit("serial") as simulated:
+        outcome = run_case(simulated.probe, case)
+    assert outcome.expected.endswith("(step 2: 1F 7F 80 1F FF > 129, after drain)")
+    assert [line.split("-> ")[1] for line in outcome.log if "->" in line] == [
+        "1F 7F 80 1F FF",
+        "1F 7F 81 1F FF",
+    ]
+
+
 @pytest.mark.parametrize(
     ("line", "fault"),
     [
-        ("sett 1017:0 5 u16", "unknown verb 'sett'; did you mean set"),
-        ("40 {txt} > *", "unknown name 'txt'; did you mean text"),
-        ("40 {text} > sometimes", "unknown answer 'sometimes'"),
+        ("sett 1017:0 5 u16", "'sett' is neither bytes, a CAN frame nor a verb; did you mean set"),
+        ("40 {text} > sometimes", "not bytes in hexadecimal or a CAN frame: 'sometimes'"),
+        ("40 {text}", "an answer or the code of an abort is missing"),
+        ("40 {text} > abort", "an answer or the code of an abort is missing"),
+        ("{request}#0", "'{request}#0' is neither bytes, a CAN frame nor a verb"),
+        ("> {tpdo_id}#0", "not bytes in hexadecimal or a CAN frame: '000#0'"),
         ("40 {text} > abort TOGLE", "40 {text} > abort TOGLE: 'TOGLE'"),
         ("set 1017:0", "missing a required argument: 'values'"),
         ("set 1017:0 70000 u16", "int too big to convert"),
@@ -122,6 +161,8 @@ def test_the_lines_after_finally_are_held_after_a_failure_which_is_reported(tmp_
         ("sleep 0.1 0.2", "too many positional arguments"),
         ("drain > VALUES", "nothing may follow >"),
         ("map {tpdo} 1 evnt=5", "unknown setting 'evnt'"),
+        ("wait", "missing a required"),
+        ("sleep -1", "'-1' is not a time in seconds"),
     ],
 )
 def test_an_error_in_a_line_names_file_case_and_line(line: str, fault: str, tmp_path: Path) -> None:
@@ -129,6 +170,13 @@ def test_an_error_in_a_line_names_file_case_and_line(line: str, fault: str, tmp_
         dialogue_cases(case_file(tmp_path, line))
     assert str(caught.value).startswith(f"{tmp_path}/modes_cases.toml: modes.one: line 2: ")
     assert fault in str(caught.value)
+
+
+def test_an_unknown_name_in_braces_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(BenchError, match=r"modes\.one: unknown name 'txt' in braces; did you mean text"):
+        dialogue_cases(case_file(tmp_path, "40 {txt} > *"))
+    with pytest.raises(BenchError, match="unknown name 'row_id' in braces"):
+        dialogue_cases(case_file(tmp_path, "40 {row_id} > *"))
 
 
 @pytest.mark.parametrize(

@@ -81,15 +81,21 @@ def test_a_row_that_reports_the_start_is_awaited_after_a_reset(
     [
         (
             "telemetri status a=1",
-            "telemetri status a=1: neither raw traffic nor a known step; did you mean telemetry?",
+            "telemetri status a=1: 'telemetri' is neither bytes, a CAN frame nor a verb; did you mean telemetry?",
         ),
-        ("drain; silence soon", "silence soon: wrong words after 'silence'"),
-        ("sleep", "sleep: wrong words after 'sleep'"),
-        ("1F 7", "1F 7: neither raw traffic nor a known step"),
+        ("drain; silence soon", "silence soon: could not convert string to float: 'soon'"),
+        ("sleep", "sleep: missing a required argument: 'seconds'"),
+        ("sleep -1", "sleep -1: '-1' is not a time in seconds"),
+        ("1F 7", "1F 7: '7' is neither bytes, a CAN frame nor a verb"),
+        ("480#0", "480#0: '480#0' is neither bytes, a CAN frame nor a verb"),
+        ("> 128", "> 128: nothing is sent"),
+        ("drain > 128", "drain > 128: nothing may follow >"),
+        ("telemetry status", "telemetry status: missing a required argument: 'setting'"),
+        ("telemetry status a", "telemetry status a: 'a' is not FIELD=VALUE"),
         ("{clear}; 00 {zzz}", "unknown name 'zzz' in braces"),
         ("00 {}", "braces: Format string contains positional fields"),
-        ("{clear}; sleep 1 2", "sleep 1 2: wrong words after 'sleep'"),
-        ("1F 7F > ack", "1F 7F > ack: neither raw traffic nor a known step"),
+        ("{clear}; sleep 1 2", "sleep 1 2: too many positional arguments"),
+        ("1F 7F > ack", "1F 7F > ack: 'ack' is neither ROW, ROW!ERROR nor a CAN frame"),
     ],
 )
 def test_a_wrong_step_of_a_file_is_named_before_the_run(lines: str, message: str, tmp_path: Path) -> None:
@@ -101,7 +107,8 @@ def test_a_wrong_step_of_a_file_is_named_before_the_run(lines: str, message: str
     )
     with pytest.raises(BenchError) as caught:
         serial_suite(read_unit(folder))
-    assert str(caught.value) == f"{path}: more.a: {message}"
+    place = "" if "braces" in message else "line 1: "
+    assert str(caught.value) == f"{path}: more.a: {place}{message}"
 
 
 def test_a_step_with_a_row_or_field_that_the_unit_lacks_fails_its_case(tmp_path: Path) -> None:
@@ -195,7 +202,11 @@ def test_cases_in_a_text_file_are_run_on_their_link(tmp_path: Path) -> None:
         outcomes = run_cases(simulated.probe, cases)
     assert [(outcome.status, outcome.expected, outcome.seen) for outcome in outcomes] == [
         ("passed", "", ""),
-        ("failed", "attitude {'boots': 7}", "{'boots': 1}"),
+        (
+            "failed",
+            "attitude {'boots': 7} (step 2: telemetry attitude boots=1 boots=7, after telemetry attitude boots=1)",
+            "{'boots': 1}",
+        ),
     ]
 
 

@@ -233,6 +233,14 @@ def run(monkeypatch, make_bench):
     return run
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Mark the tests that start workers."""
+    for item in items:
+        if "worker" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.process)
+
+
 @pytest.fixture
 def worker(monkeypatch):
     """Make workers that run the given programs, one after the other; the last one from then on."""

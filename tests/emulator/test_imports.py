@@ -10,6 +10,8 @@ import pytest
 
 import starhil
 
+pytestmark = pytest.mark.process
+
 FOR_THE_WORKER = ("numba", "scipy", "sklearn", "cv2", "matplotlib", "erfa", "sgp4", "aiohttp", "mcap")
 
 
@@ -20,11 +22,8 @@ def test_the_links_start_without_the_libraries_of_the_pipeline():
 
 
 PROFILES = sorted(
-    path.stem
-    for path in (Path(starhil.__file__).parent / "configs" / "profiles").glob("*.toml")
-    if "\n[identifier]" not in path.read_text(encoding="utf-8")
+    path.stem for path in (Path(starhil.__file__).parent / "configs" / "profiles").glob("*.toml")
 )
-"""Profiles without options of an identifier, which are checked by its class and thus load its kernels."""
 
 
 @pytest.mark.parametrize("profile", PROFILES)

@@ -137,7 +137,7 @@ def as_json(document: Any) -> bytes:
 
 def run_document() -> dict[str, Any]:
     """Return the file of a recorded run."""
-    return {"format": 1, "folder": ".", "profile": Profile().model_dump(mode="json"), "ends": True}
+    return {"format": 1, "folder": ".", "profile": Profile().model_dump(mode="json"), "machine": {}}
 
 
 TAPE = [

@@ -55,7 +55,7 @@ def rows_of(unit: str) -> tuple[list[Request], list[Reply]]:
         kind = ReplyKind.ACK if is_command else ReplyKind.TELEMETRY
         data = b"" if is_command else row.encode()
         if len(data) < 200:
-            replies.append(Reply(kind, row.id, data, klass=row.klass))
+            replies.append(Reply(kind, row.id, data, message_class=row.message_class))
     return requests, replies
 
 
@@ -66,7 +66,7 @@ def examined(unit: str, events: Any) -> int:
         if isinstance(event, LinkFault):
             continue
         count += 1
-        row = icd.row(event.id or 0, event.klass)
+        row = icd.row(event.id or 0, event.message_class)
         if row is not None:
             try:
                 row.decode(event.data)

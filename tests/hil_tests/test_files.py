@@ -135,7 +135,8 @@ def test_frames_are_written_as_they_are_read(text):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "07360104", "#00", "12#00", "123#0", "123#000102030405060708", "GGG#00", "FFFFFFFF#"]
+    "text",
+    ["", "07360104", "#00", "12#00", "123#0", "123#000102030405060708", "123#00*", "GGG#00", "FFFFFFFF#"],
 )
 def test_an_invalid_frame_is_rejected(text):
     with pytest.raises(BenchError):
@@ -146,6 +147,16 @@ def test_dots_in_a_pattern_stand_for_any_byte():
     assert matches(pattern("1f 7f .. 1f ff"), "1F7F031FFF")
     assert not matches(pattern("1f 7f .. 1f ff"), "1F7F03041FFF")
     assert matches(pattern("05850401#..02"), "05850401#FF02")
+
+
+def test_a_star_at_the_end_of_a_pattern_stands_for_any_bytes():
+    assert matches(pattern("1f 7f *"), "1F7F")
+    assert matches(pattern("1f 7f *"), "1F7F031FFF")
+    assert not matches(pattern("1f 7f *"), "1F07")
+    assert matches(pattern("181#2a*"), "181#2A00")
+    assert not matches(pattern("181#2a*"), "182#2A00")
+    with pytest.raises(BenchError, match="not bytes in hexadecimal or a CAN frame"):
+        pattern("1f * 7f")
 
 
 def test_percentiles_are_nearest_rank():

@@ -53,6 +53,7 @@ def test_a_case_of_conformance_is_shown_with_its_control_characters_escaped():
     assert out.getvalue() == (f"✗ a.b  {SHOWN} [{SHOWN}]\n    expected {SHOWN}\n    seen     {SHOWN}\n")
 
 
+@pytest.mark.process
 def test_title_and_steps_of_a_session_are_shown_with_their_control_characters_escaped(tmp_path):
     script = tmp_path / "s.toml"
     text = r'"a\u001b]0;b\u0007\u009b2J\u202ec\nd"'

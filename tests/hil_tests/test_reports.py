@@ -129,6 +129,7 @@ def test_a_report_into_a_device_leaves_the_device(tmp_path):
     assert sorted(tmp_path.iterdir()) == [full, null]
 
 
+@pytest.mark.process
 def test_a_report_into_the_standard_output_comes_between_the_lines_printed_there(tmp_path):
     file = tmp_path / "output"
     code = (

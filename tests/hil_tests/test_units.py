@@ -89,17 +89,19 @@ def ask(tmp_path):
     return ask
 
 
-STATUS = Reply(ReplyKind.TELEMETRY, 1, struct.pack("<H", 7), klass="get")
+STATUS = Reply(ReplyKind.TELEMETRY, 1, struct.pack("<H", 7), message_class="get")
 
 
 def test_a_row_is_distinguished_from_one_of_another_class_with_the_same_id(ask):
-    client, values = ask(lambda obc: obc.telemetry("status"), Reply(ReplyKind.ACK, 1, klass="do"), STATUS)
+    client, values = ask(
+        lambda obc: obc.telemetry("status"), Reply(ReplyKind.ACK, 1, message_class="do"), STATUS
+    )
     assert values == {"count": 7}
-    assert [reply.klass for reply in client.stray_replies] == ["do"]
+    assert [reply.message_class for reply in client.stray_replies] == ["do"]
 
 
 def test_a_telecommand_is_answered_by_the_row_that_the_unit_names(ask):
-    other = Reply(ReplyKind.TELEMETRY, 2, b"\0\0", klass="get")
+    other = Reply(ReplyKind.TELEMETRY, 2, b"\0\0", message_class="get")
     client, ack = ask(lambda obc: obc.command("go"), other, STATUS)
     assert ack.name == "go"
     assert list(client.stray_replies) == [other]
@@ -113,7 +115,7 @@ def test_a_telecommand_without_an_answer_is_not_waited_for(ask):
 
 def test_a_refusal_has_the_name_that_the_unit_gives_its_number(ask):
     with pytest.raises(NackError, match=r"error 66 \(busy\)"):
-        ask(lambda obc: obc.command("go"), Reply(ReplyKind.NACK, 1, code=66, klass="do"))
+        ask(lambda obc: obc.command("go"), Reply(ReplyKind.NACK, 1, code=66, message_class="do"))
 
 
 def test_a_streamed_row_that_looks_like_an_answer_is_unsolicited(tmp_path):

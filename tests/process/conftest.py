@@ -10,6 +10,8 @@ from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from starhil.protocol.transports.can import kernel_can_is_up
 
 FAST_BAUD = 921600
+NO_IMAGES = "run.worker=error_model"
+"""Setting of an emulator whose images do not matter: it starts in a third of the processor time."""
 
 needs_vcan0 = pytest.mark.skipif(
     not kernel_can_is_up("vcan0"),
@@ -43,20 +45,29 @@ def running_emulator(bus, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def emulator(running_emulator):
-    """The emulator after a reset with the parameters of its profile, whatever other modules have set and saved."""
+    """The emulator after a reset with the parameters of its profile, whatever other modules have set and saved.
+
+    It ends in standby: in another mode it would render images while other modules run.
+    """
     with ObcClient.open(can=running_emulator.ready["can"], timeout_s=5.0) as client:
         for command in ("default_parameters", "save_parameters", "reset"):
             client.command(command)
         client.wait_for("device_status", lambda reading: reading["reset_cause"] == "command", within_s=60.0)
         client.wait_for("device_status", lambda reading: reading["mode"] == "standby", within_s=60.0)
-    return running_emulator
+    yield running_emulator
+    with ObcClient.open(can=running_emulator.ready["can"], timeout_s=5.0) as client:
+        client.command("set_mode", mode="standby")
 
 
 @pytest.fixture(scope="session")
 def sagitta(tmp_path_factory):
     """An emulated Sagitta on a pty."""
     command = emulator_command(
-        profile="ideal", unit="sagitta", seed=1, state_dir=tmp_path_factory.mktemp("sagitta")
+        profile="ideal",
+        unit="sagitta",
+        seed=1,
+        settings=[NO_IMAGES],
+        state_dir=tmp_path_factory.mktemp("sagitta"),
     )
     with EmulatorProcess(command) as process:
         yield process

@@ -17,6 +17,7 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.protocol.files.bundled import find_unit
+from tests.process.conftest import NO_IMAGES
 from tests.process.test_sessions import starhil
 
 pytestmark = pytest.mark.process
@@ -74,7 +75,9 @@ def test_areas_pass_on_pty_bus_and_canopen_and_are_reported(tmp_path):
 def test_safe_cases_change_nothing(tmp_path):
     rows = ("device_status", "boot_status", "star_config")
     chosen = ["serial.framing", "serial.telemetry", "serial.identifiers", "serial.timing", "serial.recovery"]
-    command = emulator_command(seed=1, state_dir=tmp_path, extra=["--clock", f"scaled:{SPEED}"])
+    command = emulator_command(
+        seed=1, state_dir=tmp_path, settings=[NO_IMAGES], extra=["--clock", f"scaled:{SPEED}"]
+    )
     with EmulatorProcess(command) as emulator:
         port = emulator.ready["serial"]
         with ObcClient.open(serial=port, timeout_s=5.0) as obc:
@@ -105,7 +108,11 @@ def test_the_attitude_of_a_running_unit_is_compared_with_its_truth_log_or_a_stat
     log = tmp_path / "truth.csv"
     attitude = "truth.attitude={ra_deg=83.8, dec_deg=-1.2, roll_deg=30}"
     command = emulator_command(
-        unit=str(served), seed=1, state_dir=tmp_path, truth_log=log, settings=["truth.kind=fixed", attitude]
+        unit=str(served),
+        seed=1,
+        state_dir=tmp_path,
+        truth_log=log,
+        settings=["truth.kind=fixed", attitude, NO_IMAGES],
     )
     with EmulatorProcess(command) as emulator:
         words = ("serial.attitude", "--unit", "sagitta", "--serial", emulator.ready["serial"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -19,6 +18,8 @@ from tests.protocol.export.test_export import same
 from tests.protocol.serial.composed_links import CUBESTAR
 
 pytestmark = pytest.mark.process
+
+PATIENCE_S = 60.0
 
 ICD = load_unit()
 CHANGES_THE_DIALECT = frozenset({"reset", "restore_parameters", "default_parameters"})
@@ -70,9 +71,9 @@ class Cosmos:
     def receive(self) -> tuple[str, Any]:
         """Return the next packet and its name."""
         try:
-            raw = self._packets.get(timeout=10.0)
+            raw = self._packets.get(timeout=PATIENCE_S)
         except Empty:
-            raise AssertionError("COSMOS received no packet within 10 s") from None
+            raise AssertionError("COSMOS received no packet in time") from None
         packet = self._telemetry.identify(raw.buffer, [self._target])
         assert packet is not None, raw.buffer
         packet.buffer = raw.buffer
@@ -148,13 +149,14 @@ def test_after_a_command_that_changes_the_dialect_cosmos_reconnects_with_the_new
     can_obc.set_parameter("serial_dialect", stored)
     can_obc.command("save_parameters")
     can_obc.set_parameter("serial_dialect", dialect)
+    up_s = can_obc.telemetry("device_status")["uptime"]
     with connect(dialect) as before:
         before.send(name.upper())
         if CUBESTAR.answers(ICD.telecommands[name]):
             answer, packet = before.receive()
             assert (answer, packet.read("COMMAND"), packet.read("CODE")) == ("ANSWER", name.upper(), "OK")
-        else:
-            time.sleep(0.2)  # the device restarts
+        else:  # the device restarts
+            can_obc.wait_for("device_status", lambda reading: reading["uptime"] < up_s, within_s=PATIENCE_S)
     with connect(DEFAULT if name == "default_parameters" else stored) as after:
         after.send("REQUEST_IDENTIFICATION")
         answer, packet = after.receive()
@@ -176,11 +178,9 @@ def test_a_refusal_comes_with_its_code(cosmos: Cosmos) -> None:
 
 def test_requests_in_a_row_keep_their_names(cosmos: Cosmos) -> None:
     names = ["QUATERNION", "RATES", "QUATERNION", "ACKNOWLEDGE", "STAR_1_RAW", "STAR_2_RAW"] * 5
-    begin = time.monotonic()
     for name in names:
         cosmos.send(f"REQUEST_{name}")
     assert [cosmos.receive()[0] for _ in names] == names
-    assert time.monotonic() - begin < 60.0
 
 
 def test_a_unit_with_another_link_is_driven_through_its_plugin(sagitta, tmp_path: Path) -> None:

@@ -13,6 +13,13 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = {
+    "starid": "starid",
+    **{name: f"starhil/{name}" for name in ("emulator", "protocol", "hil_tests", "configs")},
+}
+"""Where the files of each folder are in the wheel."""
+QUICK = 'extends = "ideal"\n[run]\nworker = "error_model"\n'
+"""Profile without images: kernels of another installation would be compiled for a minute, as those of the first start."""
 OUR_ROOMS = ("emulator", "protocol", "hil_tests", "configs", "tools", "tests")
 
 OBC_TEST = """
@@ -45,6 +52,7 @@ def project(wheel, tmp_path_factory) -> Path:
         (folder / name).mkdir()
         (folder / name / "__init__.py").write_text('OWNER = "flight software"\n')
     (folder / "tests" / "test_obc.py").write_text(OBC_TEST)
+    (folder / "quick.toml").write_text(QUICK)
     _install(wheel, folder / ".venv")
     return folder
 
@@ -86,15 +94,32 @@ def test_the_wheel_brings_two_packages_and_no_more(wheel):
     assert {top for top in tops if not top.endswith(".dist-info")} == {"starhil", "starid"}
 
 
+def test_the_wheel_brings_every_file_of_the_packages(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        brought = {name for name in archive.namelist() if name.startswith(tuple(PACKAGES.values()))}
+    files = {
+        f"{target}/{file.relative_to(ROOT / folder).as_posix()}"
+        for folder, target in PACKAGES.items()
+        for file in (ROOT / folder).rglob("*")
+        if file.is_file() and "__pycache__" not in file.parts
+    }
+    assert brought == files
+
+
 def test_plugin_and_fixtures_work_next_to_folders_of_the_same_names(project):
-    out = _run([str(project / ".venv/bin/python"), "-m", "pytest", "-q", "tests"], project)
+    out = _run(
+        [str(project / ".venv/bin/python"), "-m", "pytest", "-q", "--starhil-profile=quick.toml", "tests"],
+        project,
+    )
     assert "2 passed" in out
 
 
 def test_a_session_starts_the_emulator_there(project):
-    _starhil(project, "session", "parameters", "--start")
+    _starhil(project, "session", "parameters", "--start", "--profile", "quick.toml")
 
 
 def test_conformance_runs_there(project):
-    out = _starhil(project, "conformance", "serial.framing", "--start", "--serial", "auto")
+    out = _starhil(
+        project, "conformance", "serial.framing", "--start", "--profile", "quick.toml", "--serial", "auto"
+    )
     assert "0 failed" in out

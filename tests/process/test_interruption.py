@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -23,14 +24,11 @@ SESSION = "[[step]]\nread = 'identification'\n[[step]]\nwait_s = 600\n[[step]]\n
 
 
 @pytest.fixture(autouse=True)
-def signals_that_are_not_ignored():
-    """Processes inherit an ignored signal: SIGHUP from `nohup`, SIGINT from a shell's background job."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT)}
-    signal.signal(signal.SIGHUP, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+def ctrl_c_is_not_ignored():
+    """Processes inherit an ignored signal: SIGINT from a shell's background job."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
+    signal.signal(signal.SIGINT, before)
 
 
 def descendants(pid: int) -> set[int]:
@@ -88,8 +86,6 @@ def interrupt(words: list, number: signal.Signals, folder: Path) -> int:
     ("name", "number"),
     [
         ("session", signal.SIGTERM),
-        ("session", signal.SIGKILL),
-        ("conformance", signal.SIGHUP),
         ("conformance", signal.SIGINT),
         ("conformance", signal.SIGKILL),
     ],
@@ -131,6 +127,27 @@ def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_pa
         child = int(parent.stdout.readline())
         parent.kill()
     wait_until(lambda: not alive(child), "the emulator outlived its parent")
+
+
+def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tmp_path):
+    control = tmp_path / "control"
+    text = (
+        "import sys, time\n"
+        "from starhil.emulator.cli.app import main\n"
+        "from starhil.emulator.truth import config\n"
+        "config.read_truth_file = lambda *_: time.sleep(600.0)\n"
+        f"sys.argv[1:] = ['run', 'demo', '--serial', 'off', '--can', 'off', '--control', 'unix:{control}']\n"
+        "sys.exit(main())\n"
+    )
+    with (
+        EmulatorProcess([sys.executable, "-c", text]),
+        socket.socket(socket.AF_UNIX) as peer,
+    ):  # ends by SIGTERM
+        peer.connect(str(control))
+        peer.sendall(b'{"do": "set_truth", "truth": {"kind": "file", "path": "/"}}\n')
+        peer.settimeout(0.5)
+        with pytest.raises(TimeoutError):  # it is being read
+            peer.recv(1)
 
 
 def test_an_interrupted_start_ends_the_emulator():

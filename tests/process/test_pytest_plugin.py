@@ -18,17 +18,14 @@ ROOT = Path(__file__).resolve().parents[2]
 COUNT = PAGE_TESTS.count("def test_")
 
 
-def run_pytest(folder: Path, program: str, *options: str) -> str:
-    """Run a program of tests in a separate pytest; return its output."""
-    path = folder / "test_it.py"
-    path.write_text(program)
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-rs", "-v", *options, str(path)]
+def run_pytest(folder: Path, programs: str | dict[str, str], *options: str) -> str:
+    """Run programs of tests in a separate pytest; return its output."""
+    files = programs if isinstance(programs, dict) else {"test_it.py": programs}
+    for name, program in files.items():
+        (folder / name).write_text(program)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-rs", "-v", *options, *files]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
     return done.stdout + done.stderr
-
-
-def test_the_tests_of_the_page_pass_with_an_emulator(tmp_path):
-    assert f"{COUNT} passed" in run_pytest(tmp_path, PAGE_TESTS)
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +43,12 @@ def test_what_a_unit_on_a_serial_line_lacks_is_skipped_by_name(unit, tmp_path):
     assert "test_an_attitude_is_found PASSED" in out
     assert "--starhil-serial names a unit; give its bus with --starhil-can" in out
     assert "--starhil-serial names a unit, and this test needs an emulator" in out
+
+
+def test_a_link_that_is_off_has_no_tests(tmp_path):
+    out = run_pytest(tmp_path, "def test_one(starhil_can): pass\n", "--starhil-can", "off")
+    assert "SKIPPED" in out
+    assert "--starhil-can off" in out
 
 
 ISOLATED = """
@@ -66,8 +69,9 @@ def test_another(starhil_serial, starhil_control):
 """
 
 
-def test_each_test_begins_after_a_reset(tmp_path):
-    assert "2 passed" in run_pytest(tmp_path, ISOLATED)
+def test_those_of_the_page_pass_with_an_emulator_and_each_test_begins_after_a_reset(tmp_path):
+    out = run_pytest(tmp_path, {"test_page.py": PAGE_TESTS, "test_isolated.py": ISOLATED})
+    assert f"{COUNT + 2} passed" in out
 
 
 FAILS = """

@@ -21,7 +21,7 @@ from starhil.hil_tests.errors import BenchError, DeviceError
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import hub_thread
 from starhil.protocol.can.frame import CanFrame
-from tests.process.conftest import FAST_BAUD
+from tests.process.conftest import FAST_BAUD, NO_IMAGES
 from tests.process.reference import frame_request
 
 pytestmark = pytest.mark.process
@@ -49,41 +49,17 @@ def own(tmp_path):
     """Make emulators with a parameter store that lasts over the test."""
     processes = []
 
-    def _make(**options) -> EmulatorProcess:
-        process = EmulatorProcess(emulator_command(seed=1, state_dir=tmp_path / "state", **options))
+    def _make(settings=(), **options) -> EmulatorProcess:
+        command = emulator_command(
+            seed=1, state_dir=tmp_path / "state", settings=[NO_IMAGES, *settings], **options
+        )
+        process = EmulatorProcess(command)
         processes.append(process)
         return process.start()
 
     yield _make
     for process in processes:
         process.kill()
-
-
-def test_power_cuts_while_parameters_are_being_stored_lose_none_of_them(own, tmp_path):
-    rng = random.Random(5)
-    emulator = own(settings=["device.boot_s=0", "parameters.update_rate=0.2"])
-    allowed = {300}
-    for turn in range(3):
-        with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
-            kept = obc.get_parameter("exposure")
-            assert kept in allowed, f"after cut {turn}"
-            assert obc.telemetry("boot_status")["boot_count"] == turn + 1
-            for value in range(1000 + 100 * turn, 1003 + 100 * turn):
-                obc.set_parameter("exposure", value)
-                obc.command("save_parameters")  # answered when it is done
-                kept = value
-            obc.set_parameter("exposure", 2000 + turn)
-            save = frame_request(obc.icd.telecommands["save_parameters"].id)
-            # the cut comes before, while or after the last one is stored
-            (answered,) = obc.run(send_and_listen(obc.core, [save], rng.random() * 0.01))
-            allowed = {2000 + turn} if answered else {kept, 2000 + turn}
-        emulator.restart(signal.SIGKILL)
-    emulator.stop()
-    files = sorted(path for path in (tmp_path / "state").iterdir() if path.is_file())
-    assert files
-    for path in files:
-        if path.suffix == ".json":
-            json.loads(path.read_text())
 
 
 NODE = 44
@@ -105,24 +81,46 @@ def canopen_master(channel: str):
         network.disconnect()
 
 
-def test_power_cuts_while_canopen_settings_are_being_stored_lose_none_of_them(own):
-    rng = random.Random(6)
+def test_power_cuts_while_parameters_and_canopen_settings_are_being_stored_lose_none_of_them(own, tmp_path):
+    """The cut comes before, while or after the last ones are stored."""
+    rng = random.Random(5)
+    exposures, heartbeats = {300}, {1000}
     with hub_thread() as channel:
-        emulator = own(serial="off", can=channel, extra=["--canopen", str(NODE)])
-        allowed = {1000}
-        for turn in range(3):
-            with canopen_master(channel) as (network, sdo):
-                assert int.from_bytes(sdo.upload(HEARTBEAT, 0), "little") in allowed, f"after cut {turn}"
+        emulator = own(
+            can=channel,
+            settings=["device.boot_s=0", "parameters.update_rate=0.2"],
+            extra=["--canopen", str(NODE)],
+        )
+        for turn in range(4):
+            with (
+                ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc,
+                canopen_master(channel) as (network, sdo),
+            ):
+                assert obc.get_parameter("exposure") in exposures, f"after cut {turn}"
+                assert int.from_bytes(sdo.upload(HEARTBEAT, 0), "little") in heartbeats, f"after cut {turn}"
+                assert obc.telemetry("boot_status")["boot_count"] == turn + 1
+                if turn == 3:
+                    break
+                for value in range(1000 + 100 * turn, 1003 + 100 * turn):
+                    obc.set_parameter("exposure", value)
+                    obc.command("save_parameters")  # answered when it is done
                 kept, last = 2000 + turn, 3000 + turn
                 sdo.download(HEARTBEAT, 0, kept.to_bytes(2, "little"))
                 sdo.download(STORE, 1, SAVE.to_bytes(4, "little"))  # answered when it is on the disk
                 sdo.download(HEARTBEAT, 0, last.to_bytes(2, "little"))
+                obc.set_parameter("exposure", last)
+                save = frame_request(obc.icd.telecommands["save_parameters"].id)
                 network.send_message(0x600 + NODE, bytes((0x23, 0x10, 0x10, 1)) + b"save")
-                time.sleep(rng.random() * 0.01)  # the cut comes before, while or after this one is stored
-            allowed = {kept, last}
+                (answered,) = obc.run(send_and_listen(obc.core, [save], rng.random() * 0.01))
+                exposures = {last} if answered else {value, last}
+                heartbeats = {kept, last}
             emulator.restart(signal.SIGKILL)
-        with canopen_master(channel) as (_, sdo):
-            assert int.from_bytes(sdo.upload(HEARTBEAT, 0), "little") in allowed
+        emulator.stop()
+    files = sorted(path for path in (tmp_path / "state").iterdir() if path.is_file())
+    assert files
+    for path in files:
+        if path.suffix == ".json":
+            json.loads(path.read_text())
 
 
 def test_a_serial_peer_that_never_reads_does_not_stop_the_device(emulator, can_obc):

@@ -11,7 +11,9 @@ from tests.process.test_sessions import starhil
 pytestmark = pytest.mark.process
 
 
-@pytest.mark.parametrize("session", ["recursive", "recursive_features"])
+@pytest.mark.parametrize(
+    "session", ["recursive", "recursive_features", "thesis_recognition", "thesis_recursion"]
+)
 def test_a_session_with_the_recursive_algorithm_passes(tmp_path, session):
     done = starhil("session", session, "--start", "--can", "auto", "--log", tmp_path, "--json")
     result = json.loads(done.stdout)

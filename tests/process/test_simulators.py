@@ -74,18 +74,17 @@ def free_port() -> int:
 
 
 @needs_basilisk
-@pytest.mark.parametrize(("motion", "seconds"), [("tumble", 120), ("pointing", 10)])
-def test_basilisk_in_lock_step(motion, seconds, tmp_path):
+def test_basilisk_in_lock_step(tmp_path):
     port = str(free_port())
     write_files(tmp_path, "basilisk.toml", port=port)
     command = emulator_command(profile=str(tmp_path / "basilisk.toml"))
     with EmulatorProcess(command) as emulator:
         write_files(tmp_path, "orbit.py", port=port, serial=emulator.ready["serial"])
-        figures = printed(start(tmp_path, "orbit.py", motion, str(seconds)))
-    assert figures["attitudes read"][0] > seconds - 4
+        figures = printed(start(tmp_path, "orbit.py", "tumble", "120"))
+    assert figures["attitudes read"][0] > 116
     assert figures["largest error of the rate"][0] < 0.01
     assert figures["within"][1] >= 99.7
-    assert (tmp_path / f"{motion}.png").read_bytes().startswith(PNG)
+    assert (tmp_path / "tumble.png").read_bytes().startswith(PNG)
 
 
 @needs_basilisk
@@ -101,7 +100,7 @@ def test_basilisk_in_real_time(tmp_path):
     with EmulatorProcess(command) as emulator:
         write_files(tmp_path, "orbit.py", "obc.py", port=port, serial=emulator.ready["serial"])
         obc = start(tmp_path, "obc.py")
-        assert printed(start(tmp_path, "orbit.py", "tumble", "6", "--real-time")) == {}
+        assert printed(start(tmp_path, "orbit.py", "pointing", "6", "--real-time")) == {}
         obc.send_signal(signal.SIGINT)
         figures = printed(obc)
     assert figures["attitudes read"][0] >= 3

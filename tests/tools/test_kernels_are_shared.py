@@ -13,6 +13,7 @@ from starid.storage.cache import cache_dir
 SHOW = [sys.executable, "-c", "from starid.storage.cache import cache_dir; print(cache_dir())"]
 
 
+@pytest.mark.process
 def test_a_process_with_another_home_uses_the_kernels_of_this_run(tmp_path):
     home = {name: str(tmp_path) for name in ("HOME", "XDG_CACHE_HOME", "XDG_STATE_HOME")}
     done = subprocess.run(SHOW, env={**os.environ, **home}, capture_output=True, text=True, check=True)

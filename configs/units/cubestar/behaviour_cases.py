@@ -30,7 +30,7 @@ from starhil.hil_tests.judge.messages import Value
 CLOCK_STEP_S: Final = 1_700_000_000
 CLOCK_TOLERANCE_S: Final = 0.25
 TEST_VALUE: Final = 137.0
-COUNTED: Final = 30
+TELEMETRY_REQUESTS: Final = 30
 
 settings = CubeStarSettings
 """What a run records and restores."""
@@ -120,10 +120,10 @@ def _counts(probe: LinkProbe) -> tuple[int, int]:
 @COUNTERS.case("telemetry", "each telemetry request counts once, including the one that reads the counters")
 def counters_telemetry(probe: LinkProbe) -> None:
     commands, before = _counts(probe)
-    for _ in range(COUNTED):
+    for _ in range(TELEMETRY_REQUESTS):
         probe.telemetry("identification")
     after_commands, after = _counts(probe)
-    check_equal((after - before) % 65536, COUNTED + 1, "increase")
+    check_equal((after - before) % 65536, TELEMETRY_REQUESTS + 1, "increase")
     check_equal(after_commands, commands, "count of telecommands")
 
 

@@ -1,7 +1,7 @@
 """The points of the vendor's interface document as cases; the clause is the page of its public copy, whose revision is unknown.
 
-Messages are made and taken apart here, byte by byte, so that the cases need nothing that the definition says. A unit with
-another address than 0Eh would answer none of them.
+Messages are built and parsed here byte by byte, so that the cases do not depend on the definition. A unit whose address is
+not 0Eh answers none of them.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ CONTROL = CaseArea[SerialProbe]("control", COPY.format(35910), links=("serial",)
 MEMORY = CaseArea[SerialProbe]("memory", COPY.format(35916), intrusive=True, links=("serial",))
 RESULT = CaseArea[SerialProbe]("result", COPY.format(35917), links=("serial",))
 COMBINED = CaseArea[SerialProbe]("combination", COPY.format(35918), intrusive=True, links=("serial",))
-COUNTED = CaseArea[SerialProbe]("counters", COPY.format(35919), intrusive=True, links=("serial",))
+COUNTER_POINTS = CaseArea[SerialProbe]("counters", COPY.format(35919), intrusive=True, links=("serial",))
 
 
 class Message(NamedTuple):
@@ -261,7 +261,7 @@ def counters(probe: SerialProbe) -> list[int]:
 def counted_case(name: str, title: str, sent: bytes, index: int | None) -> None:
     """Declare a case: bytes, and the counter that they raise by one."""
 
-    @COUNTED.case(name, title)
+    @COUNTER_POINTS.case(name, title)
     def run(probe: SerialProbe) -> None:
         before = counters(probe)
         check_equal(len(received(probe, sent)), 0, "messages")

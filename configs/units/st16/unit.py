@@ -38,7 +38,7 @@ LENGTH_ADDRESS = 0x4C
 COUNTER_ADDRESS = 0x50
 """Framing errors, runts, oversize messages, bad CRCs, FIFO overflows, u32 each: which are counted, and when, is in 1-35919; the
 address is ours."""
-COUNTED = (FaultKind.UART_PROTOCOL, FaultKind.UART_SHORT, FaultKind.UART_OVERLONG, FaultKind.UART_CHECK)
+FAULTS = (FaultKind.UART_PROTOCOL, FaultKind.UART_SHORT, FaultKind.UART_OVERLONG, FaultKind.UART_CHECK)
 """Faults of the first four counters; the FIFO never overflows."""
 ANALOG = {
     "mcu_current": 0.1, "bus_voltage": 5.0, "core_voltage": 1.2, "mcu_voltage": 3.3, "io_voltage": 3.3, "mcu_temperature": 20.0,
@@ -82,13 +82,13 @@ def sequence_of(device: Any) -> Sequence:
     return found
 
 
-def reader(shot: Any) -> Callable[..., float]:
+def reader(snapshot: Any) -> Callable[..., float]:
     """Return a function that reads quantities of this moment by name, or a default if one has no value."""
     # Imported here because reading the definition must not require the emulator.
     from starhil.emulator.device.quantities import getter_of
 
     def value(name: str, default: float = 0.0) -> float:
-        found = getter_of(name)(shot)
+        found = getter_of(name)(snapshot)
         return float(found) if isinstance(found, (int, float)) else default
 
     return value
@@ -111,9 +111,13 @@ def first(stars: Any, count: int, empty: Any, of: Callable[[Any], Any]) -> list[
     return [of(star) for star in stars[:count]] + [empty] * (count - len(stars[:count]))
 
 
-def epoch_s(shot: Any) -> float:
+def epoch_s(snapshot: Any) -> float:
     """Return the middle of the exposure on the count of TIME, seconds since start; 0 before the first."""
-    return 0.0 if shot.frame is None else (shot.frame.mid_ns - shot.now_ns + shot.uptime_ns) / 1e9
+    return (
+        0.0
+        if snapshot.frame is None
+        else (snapshot.frame.mid_ns - snapshot.now_ns + snapshot.uptime_ns) / 1e9
+    )
 
 
 def hardware(value: Callable[..., float]) -> bytes:
@@ -122,12 +126,12 @@ def hardware(value: Callable[..., float]) -> bytes:
     return bytes(12) + struct.pack("<h", celsius) + bytes(42)
 
 
-def result(shot: Any) -> bytes:
+def result(snapshot: Any) -> bytes:
     """Return the result of the last measurement; both images are the one that the emulator takes."""
-    value = reader(shot)
-    valid, epoch = bool(value("attitude.valid")), epoch_s(shot)
+    value = reader(snapshot)
+    valid, epoch = bool(value("attitude.valid")), epoch_s(snapshot)
     quaternion = [value(f"attitude.{axis}") for axis in "wxyz"]
-    stars, code, count = shot.stars, 0 if valid else NOT_FOUND, int(value("stars.matched"))
+    stars, code, count = snapshot.stars, 0 if valid else NOT_FOUND, int(value("stars.matched"))
     head = struct.pack(
         "<II4d3dd",
         int(value("frame.counter")),
@@ -157,41 +161,41 @@ def result(shot: Any) -> bytes:
         "<IiII2diiiId10i4d6d",
         1, code, 0, 0, 0.0, value("attitude.confidence"), 0, 0, count, 0, 0.0, *mapping, *quaternion, *bytes(6),
     )  # fmt: skip
-    statistics = struct.pack("<HH", *2 * (shot.constants.image_size[1],)) + bytes(168)
+    statistics = struct.pack("<HH", *2 * (snapshot.constants.image_size[1],)) + bytes(168)
     return b"".join(
         (head, hardware(value), statistics, bytes(4), image * 2, rate, centroids * 2, matching * 2)
     )
 
 
-def self_test(shot: Any) -> bytes:
+def self_test(snapshot: Any) -> bytes:
     """Return the result of the self-test: analog values at each step, and two tests, which have found no error."""
-    frame, value = analog(shot), reader(shot)
+    frame, value = analog(snapshot), reader(snapshot)
     return b"".join((frame * 10, bytes(8), frame, hardware(value), frame, bytes(172), frame))
 
 
-def whole_result(state: Sequence, shot: Any) -> bytes:
+def whole_result(state: Sequence, snapshot: Any) -> bytes:
     """Return the result that the last GO code asked for."""
-    return self_test(shot) if state.code & TEST else result(shot)
+    return self_test(snapshot) if state.code & TEST else result(snapshot)
 
 
 # --- EDAC memory ---
 
 
-def analog(shot: Any) -> bytes:
+def analog(snapshot: Any) -> bytes:
     """Return an analog frame."""
-    value = reader(shot)
+    value = reader(snapshot)
     defaults = ANALOG | {"mcu_temperature": value("temperature.detector")}
     return struct.pack("<8f", *(value(f"health.{name}", default) for name, default in defaults.items()))
 
 
-def edac(state: Sequence, shot: Any) -> bytes:
+def edac(state: Sequence, snapshot: Any) -> bytes:
     """Return EDAC memory: what was written, and over it what the unit keeps there."""
     memory = bytearray(state.memory)
-    done = state.code & ON and shot.frames > state.frames
-    counters = [shot.counters.faults.get(kind, 0) for kind in COUNTED] + [0]
+    done = state.code & ON and snapshot.frames > state.frames
+    counters = [snapshot.counters.faults.get(kind, 0) for kind in FAULTS] + [0]
     for address, data in (
-        (ANALOG_ADDRESS, analog(shot)),
-        (LENGTH_ADDRESS, struct.pack("<I", len(whole_result(state, shot)) if done else 0)),
+        (ANALOG_ADDRESS, analog(snapshot)),
+        (LENGTH_ADDRESS, struct.pack("<I", len(whole_result(state, snapshot)) if done else 0)),
         (COUNTER_ADDRESS, struct.pack("<5I", *counters)),
     ):
         memory[address : address + len(data)] = data
@@ -290,13 +294,13 @@ def dark_window(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
 @action("combination")
 def combination(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
     """Execute a GO code and answer with the parts of the result that the bits select, in a row."""
-    state, shot = sequence_of(device), device.snapshot()
+    state, snapshot = sequence_of(device), device.snapshot()
     parts, code = arguments["parts_low"] | arguments["parts_high"] << 16, arguments["code"]
     tested = bool(parts >> SELF_TEST_BIT & 1)
     state.begin(code, 0)
     why = (
         "functional processor is off" if not code & ON
-        else "no result yet" if shot.frame is None
+        else "no result yet" if snapshot.frame is None
         else "self-test and operational parts are not in one result" if tested != bool(code & TEST)
         else ""
     )  # fmt: skip
@@ -304,7 +308,7 @@ def combination(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
         raise refused(
             data=bytes((PROCESSING if code & ON else IDLE,)) + why.encode("ascii"), code=ErrorCode.SEQUENCE
         )
-    memory = whole_result(state, shot)
+    memory = whole_result(state, snapshot)
     chosen = [part for bit, part in enumerate(PARTS) if parts >> bit & 1]
     stream = memory if tested else b"".join(part_of(memory, *part) for part in chosen)
     starts = range(0, max(len(stream), 1), MAX_MESSAGE_SIZE)
@@ -312,12 +316,12 @@ def combination(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
 
 
 @quantity("time.low", unit="us", doc="Lower 32 bits of the count of microseconds since start.")
-def time_low(shot: Any) -> int:
+def time_low(snapshot: Any) -> int:
     """Return bits 0 to 31 of TIME."""
-    return int(shot.uptime_ns // 1000 & 0xFFFFFFFF)
+    return int(snapshot.uptime_ns // 1000 & 0xFFFFFFFF)
 
 
 @quantity("time.high", doc="Upper 16 bits of the count of microseconds since start.")
-def time_high(shot: Any) -> int:
+def time_high(snapshot: Any) -> int:
     """Return bits 32 to 47 of TIME."""
-    return int(shot.uptime_ns // 1000 >> 32 & 0xFFFF)
+    return int(snapshot.uptime_ns // 1000 >> 32 & 0xFFFF)

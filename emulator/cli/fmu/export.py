@@ -37,8 +37,8 @@ def export_fmu(path: Path, profile: str, command: str, fmi: Fmi) -> None:
     EmulatorError
         There is no C compiler, or it fails.
     """
-    found = variables(profile, command)
-    token = "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, repr((version("starhil"), fmi, found)))) + "}"
+    model_variables = variables(profile, command)
+    token = "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, repr((version("starhil"), fmi, model_variables)))) + "}"
     template = Template(
         _text("modelDescription.xml.j2"),
         autoescape=True,
@@ -48,10 +48,10 @@ def export_fmu(path: Path, profile: str, command: str, fmi: Fmi) -> None:
     )
     files = {
         "modelDescription.xml": template.render(
-            fmi=fmi, model=MODEL, token=token, version=version("starhil"), variables=found
+            fmi=fmi, model=MODEL, token=token, version=version("starhil"), variables=model_variables
         ),
         "sources/shell.c": _text("shell.c"),
-        "sources/model.h": _header(found, token),
+        "sources/model.h": _header(model_variables, token),
     }
     if fmi == "3":
         files["sources/buildDescription.xml"] = _text("buildDescription.xml")
@@ -82,13 +82,14 @@ def _compile(folder: Path) -> None:
         raise EmulatorError(f"fmu export: {compiler} failed: {done.stderr.strip().partition(chr(10))[0]}")
 
 
-def _header(found: list[Variable], token: str) -> str:
+def _header(model_variables: list[Variable], token: str) -> str:
     """Return model.h: all variables with their start values, and the numbers of those that the shell uses."""
     rows = [
-        f"{{{c_string(each.name)}, {each.kind('3').upper()}, {each.causality.upper()}}}" for each in found
+        f"{{{c_string(each.name)}, {each.kind('3').upper()}, {each.causality.upper()}}}"
+        for each in model_variables
     ]
-    texts = [each for each in found if isinstance(each.start, str)]
-    numbers = found[: -len(texts)]
+    texts = [each for each in model_variables if isinstance(each.start, str)]
+    numbers = model_variables[: -len(texts)]
     return "\n".join((
         "/* Generated with modelDescription.xml. */",
         f"#define TOKEN {c_string(token)}",

@@ -79,11 +79,11 @@ class Simulation:
         if self._offset_s is None:
             self._offset_s = message["t"] - answer["run_time_s"]
         for row in self._control.do("frames")["frames"]:
-            found = {
+            outputs = {
                 each.name: row.get(each.key or each.name) for each in VARIABLES if each.causality == "output"
             }
-            found["exposure_s"] = row["run_time_s"] + self._offset_s
-            values |= {name: value for name, value in found.items() if value is not None}
+            outputs["exposure_s"] = row["run_time_s"] + self._offset_s
+            values |= {name: value for name, value in outputs.items() if value is not None}
 
     def warnings(self) -> str:
         """Return what the emulator has reported since the last call."""

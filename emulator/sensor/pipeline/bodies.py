@@ -14,7 +14,7 @@ import numpy as np
 from starhil.emulator.sensor.pipeline.messages import FrameResult
 from starhil.emulator.sensor.sky.light import disc_in_field, through_baffle
 from starhil.emulator.sensor.sky.objects import SkyObjects
-from starid.arrays import Array
+from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import Camera
 
@@ -43,8 +43,13 @@ def bodies_in_field(sky: SkyObjects, attitude: Attitude, camera: Camera) -> tupl
 
 def stars_seen(stars_xy: Array, detections_xy: Array) -> int:
     """Return how many of a frame's stars (n, 2), brightest first, were detected (m, 2)."""
-    offsets = stars_xy[:_BRIGHTEST, None] - detections_xy
-    return int(np.count_nonzero((np.hypot(offsets[..., 0], offsets[..., 1]) <= SEEN_PX).any(axis=1)))
+    return int(np.count_nonzero(near_any(stars_xy[:_BRIGHTEST], detections_xy)))
+
+
+def near_any(xy: Array, others_xy: Array) -> Mask:
+    """Return which positions (n, 2) are those of a star and its detection together with one of the others (m, 2)."""
+    offsets = xy[:, None] - others_xy
+    return np.asarray((np.hypot(offsets[..., 0], offsets[..., 1]) <= SEEN_PX).any(axis=1), dtype=np.bool_)
 
 
 def with_bodies(result: FrameResult, in_field: tuple[str, ...], *, enough_stars: bool) -> FrameResult:

@@ -167,6 +167,8 @@ class IndexRequest:
 
     settings: SolverSettings
     upsets: tuple[CatalogUpset, ...] = ()
+    rehearsals: tuple[FrameRequest, ...] = ()
+    """Frames to take without a result, so that every kernel that they need is compiled before the first one that counts."""
 
 
 @dataclass(frozen=True)
@@ -232,6 +234,10 @@ class FrameResult:
     """As in `starid.identification.solution.Solution`."""
     features: FeatureReport | None = None
     """How an algorithm of the thesis worked; None for `geometric`."""
+    false_detected: int = 0
+    """Number of detections that are false stars of a rendered image, if an algorithm of the thesis ran."""
+    false_removed: int = 0
+    """Number of those that its false-star filter removed."""
     index_pending: bool = False
     """Whether the frame was solved with the star index of earlier settings, because a new one is being built."""
     background_dn: float = 0.0

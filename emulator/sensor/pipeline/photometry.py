@@ -62,7 +62,7 @@ def measure_photometry(
     return _limit_of(np.concatenate(magnitudes), np.concatenate(errors))
 
 
-def _compared(frame: Frame, found: Detections, zero_e: float) -> tuple[Array, Array]:
+def _compared(frame: Frame, detections: Detections, zero_e: float) -> tuple[Array, Array]:
     """Magnitudes of the stars in an image, and the errors of those found; NaN for the others."""
     height, width = frame.image.shape
     xy = frame.stars.xy_px
@@ -75,11 +75,11 @@ def _compared(frame: Frame, found: Detections, zero_e: float) -> tuple[Array, Ar
     alone = ~(np.tril(apart < _BLEND_PX, -1)).any(axis=1)  # no brighter star of which it would be a part
     xy, true = xy[alone], true[alone]
     error = np.full(true.size, np.nan)
-    if len(found.flux) and len(xy):
-        distance = np.hypot(*(xy[:, None] - found.xy_px[None]).transpose(2, 0, 1))
+    if len(detections.flux) and len(xy):
+        distance = np.hypot(*(xy[:, None] - detections.xy_px[None]).transpose(2, 0, 1))
         nearest = distance.argmin(axis=1)
         seen = distance[np.arange(len(xy)), nearest] < _MATCH_PX
-        flux = np.maximum(found.flux[nearest[seen]], 1.0)
+        flux = np.maximum(detections.flux[nearest[seen]], 1.0)
         error[seen] = -2.5 * np.log10(flux / zero_e) - true[seen]
     return true, error
 
@@ -92,10 +92,10 @@ def _limit_of(magnitude: Array, error: Array) -> MeasuredPhotometry:
         of_class = (magnitude >= low) & (magnitude < low + _BIN_MAG)
         if np.count_nonzero(of_class) < _FEWEST:
             continue
-        seen = error[of_class & np.isfinite(error)]
-        share = seen.size / np.count_nonzero(of_class)
+        detected = error[of_class & np.isfinite(error)]
+        share = detected.size / np.count_nonzero(of_class)
         if share < FOUND_SHARE:
             return MeasuredPhotometry(float(low), sigma)
         limit = float(low) + _BIN_MAG
-        sigma = float(_MAD_TO_SIGMA * np.median(np.abs(seen - np.median(seen))))
+        sigma = float(_MAD_TO_SIGMA * np.median(np.abs(detected - np.median(detected))))
     return MeasuredPhotometry(limit, sigma)

@@ -18,7 +18,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.pipeline.binning import mean_over_squares
-from starhil.emulator.sensor.pipeline.bodies import bodies_in_field, stars_seen, with_bodies
+from starhil.emulator.sensor.pipeline.bodies import bodies_in_field, near_any, stars_seen, with_bodies
 from starhil.emulator.sensor.pipeline.image_source import ImageSource, open_images, used_bits
 from starhil.emulator.sensor.pipeline.messages import (
     Failure,
@@ -169,6 +169,8 @@ class Pipeline:
         try:
             if isinstance(request, IndexRequest):
                 self._identifiers.build(self._identifier_setup(request))
+                for rehearsal in request.rehearsals:
+                    self._rehearse(rehearsal)
                 return IndexReady()
             if isinstance(request, ImageRequest):
                 return self._scaled_image(request)
@@ -177,6 +179,30 @@ class Pipeline:
             return Failure(str(error))
         except Exception as error:  # noqa: BLE001 (one frame that fails must not end those after it)
             return Failure(f"pipeline: internal error: {one_line(error)}")
+
+    def _rehearse(self, request: FrameRequest) -> None:
+        """Take a frame that does not count: as it is, and with the bodies of its sky in the field.
+
+        Only `geometric` keeps nothing from frame to frame, so that only it identifies stars in them.
+        """
+        if self.images is not None:
+            return
+        last = self._last
+        if self._setup.algorithm == "geometric":
+            for predicted in (None, request.truth.attitude):
+                self._process_frame(replace(request, predicted=predicted))
+        else:
+            self.detections(request)
+        truth = request.truth
+        objects = self._sky.view(truth.unix_s, None, None, request.faults).objects
+        placed = {
+            name: getattr(_WARM_UP_BODIES, name)
+            for name in ("sun", "moon", "earth")
+            if getattr(objects, name)
+        }
+        if placed:
+            self._renderer.render(Attitude.identity(), objects=replace(objects, **placed))
+        self._last = last
 
     def _process_frame(self, request: FrameRequest) -> FrameResult:
         begin = time.perf_counter()
@@ -200,6 +226,11 @@ class Pipeline:
             seen = stars_seen(stars.xy_px[stars.visible], found.xy_px) if exposure.in_field else 0
             enough = seen >= request.settings.min_stars_matched
             result = with_bodies(result, exposure.in_field, enough_stars=enough)
+            if solution.features is not None and exposure.frame.objects is not None:
+                false = near_any(found.xy_px, exposure.frame.objects.false_xy_px)
+                removed = list(solution.features.removed_index)
+                counts = int(np.count_nonzero(false)), int(np.count_nonzero(false[removed]))
+                result = replace(result, false_detected=counts[0], false_removed=counts[1])
         if request.preview:
             result = replace(result, preview=self._preview(exposure, sensor, found, solution))
         return result if current else replace(result, index_pending=True)

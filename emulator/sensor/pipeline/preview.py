@@ -12,6 +12,8 @@ The overlay is JSON; places in the image are pairs x, y, pixels:
 - ``false_stars``: their places;
 - ``bodies``: ``name`` (`sun`, `moon`, `earth`, or that of a planet), ``ra_deg`` and ``dec_deg`` of the centre, ICRS, angular
   ``radius_deg`` (0 for a point), and ``outline_px`` of the disc, null where the lens maps no direction;
+- ``features``: how an algorithm of the thesis worked, null for `geometric`: the fields of
+  `starid.identification.solution.FeatureReport` that the page shows;
 - ``covered``: polygons of the areas that are covered by something near the lens.
 """
 
@@ -32,7 +34,7 @@ from starhil.emulator.sensor.sky.objects import CelestialBody, Obstruction, SkyO
 from starid.arrays import Array, GreyImage, Indices32
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.identification.solution import Solution
+from starid.identification.solution import FeatureReport, Solution
 from starid.imaging.detection import Detections
 
 JPEG_QUALITY: Final = 72
@@ -50,12 +52,12 @@ def make_preview(
     camera: Camera,
     sensor: SensorModel,
     sky: SkyObjects,
-    found: Detections | None = None,
+    detected: Detections | None = None,
     solution: Solution | None = None,
 ) -> Preview:
     """Make the preview of a frame, without detections if it was not solved."""
-    background = float(np.median(frame.image[::16, ::16])) if found is None else found.background
-    noise = max(1.0, 0.0 if found is None else found.noise)
+    background = float(np.median(frame.image[::16, ::16])) if detected is None else detected.background
+    noise = max(1.0, 0.0 if detected is None else detected.noise)
     height, width = frame.image.shape
     stars, objects = frame.stars, frame.objects
     bright = stars.magnitude <= FAINTEST_V
@@ -64,16 +66,17 @@ def make_preview(
     catalogue = zip(
         hip.tolist(), *xy_px.round(1).T.tolist(), stars.magnitude[bright].round(2).tolist(), strict=True
     )
-    detections, hips = ([], []) if found is None else _detections(found, solution, sensor)
+    detections, hips = ([], []) if detected is None else _detections(detected, solution, sensor)
     overlay = {
         "width": width,
         "height": height,
         "detections": detections,
         "hips": hips,
-        "unused": [] if found is None else unused_stars(found.xy_px, hips, hip, xy_px),
+        "unused": [] if detected is None else unused_stars(detected.xy_px, hips, hip, xy_px),
         "catalogue": list(catalogue),
         "false_stars": [] if objects is None else objects.false_xy_px.round(1).tolist(),
         "bodies": _bodies(sky, camera, frame.attitude),
+        "features": None if solution is None else _features(solution.features),
         "covered": [_covered(obstruction, width, height) for obstruction in sky.obstructions],
     }
     content = json.dumps(overlay, separators=(",", ":")).encode()
@@ -95,17 +98,17 @@ def compress(image: GreyImage, background: float, noise: float, bits: int) -> by
 
 
 def _detections(
-    found: Detections, solution: Solution | None, sensor: SensorModel
+    detected: Detections, solution: Solution | None, sensor: SensorModel
 ) -> tuple[list[tuple[float, float, float, float]], list[int]]:
     """Return the detections with their Hipparcos numbers."""
     zero = sensor.zero_magnitude_e_s * sensor.exposure_s
-    magnitude = -2.5 * np.log10(np.maximum(found.flux, 1.0) / zero)
-    snr = found.flux / found.flux_sigma
-    hips = np.zeros(len(found.flux), dtype=np.int64)
+    magnitude = -2.5 * np.log10(np.maximum(detected.flux, 1.0) / zero)
+    snr = detected.flux / detected.flux_sigma
+    hips = np.zeros(len(detected.flux), dtype=np.int64)
     if solution is not None and solution.valid:
         hips[solution.detection_index] = solution.hip
     rows = zip(
-        *found.xy_px.round(2).T.tolist(), magnitude.round(2).tolist(), snr.round(1).tolist(), strict=True
+        *detected.xy_px.round(2).T.tolist(), magnitude.round(2).tolist(), snr.round(1).tolist(), strict=True
     )
     return list(rows), hips.tolist()
 
@@ -120,6 +123,24 @@ def unused_stars(detections_xy: Array, hips: list[int], hip: Indices32, xy_px: A
         if row >= 0 and distances[row] <= SEEN_PX and hips[row] == unused[row] == 0:
             unused[row] = number
     return unused
+
+
+def _features(report: FeatureReport | None) -> dict[str, Any] | None:
+    """Return the part of a report that a page shows."""
+    if report is None:
+        return None
+    return {
+        "search": report.search,
+        "triggered": report.triggered,
+        "refined": report.refined,
+        "error_psi": None if math.isnan(report.error_psi) else round(report.error_psi, 3),
+        "weights": report.weights,
+        "observed": [round(value, 2) for value in report.observed],
+        "of_cell": [round(value, 2) for value in report.of_cell],
+        "region_deg": round(report.region_deg, 2),
+        "region_at_deg": [round(value, 3) for value in report.region_at_deg],
+        "removed": list(report.removed_index),
+    }
 
 
 def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[dict[str, Any]]:

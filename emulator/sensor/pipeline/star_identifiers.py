@@ -6,34 +6,23 @@ ready, frames are solved with the current identifier.
 
 from __future__ import annotations
 
-import importlib
-import inspect
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, fields, is_dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin, get_type_hints
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.pipeline.messages import CatalogUpset
-from starhil.protocol.errors import remedy
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.identification.star_identifier import ALGORITHMS, StarIdentifier, make_identifier
+from starid.identification.star_identifier import StarIdentifier, make_identifier
 
 if TYPE_CHECKING:
     from starid.identification.geometric.identifier import Identifier
-
-_KINDS: Final[dict[str, tuple[type, ...]]] = {
-    "float": (int, float),
-    "int": (int,),
-    "bool": (bool,),
-    "str": (str,),
-}
-"""Type name in an annotation → types accepted from a profile."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +35,13 @@ class StarIdentifierSetup:
     margin: float
     """Tolerance of triangle sides relative to the nominal one; geometric algorithm only."""
     options: tuple[tuple[str, Any], ...]
-    """Keyword arguments of the algorithm's class, sorted by name."""
+    """Fields of the algorithm's options, sorted by name."""
     upsets: tuple[CatalogUpset, ...] = ()
     """Bits flipped in the directions of the stars; geometric algorithm only."""
 
     def make(self, catalog: StarCatalog) -> StarIdentifier:
         """Make the star identifier, which takes seconds if its index is not cached on disk."""
         options = dict(self.options)
-        check_options(self.algorithm, options)
         if self.algorithm != "geometric":
             return make_identifier(self.algorithm, self.camera, catalog, **options)
         from starid.identification.geometric.identifier import Effort, Identifier
@@ -66,21 +54,6 @@ class StarIdentifierSetup:
         return identifier
 
 
-def check_options(algorithm: str, options: Mapping[str, Any]) -> None:
-    """Reject an option that an algorithm does not have, or a value of the wrong type."""
-    module, name = ALGORITHMS[algorithm]
-    known = _known_options(getattr(importlib.import_module(module), name))
-    for option, value in options.items():
-        if option not in known:
-            hint = remedy(option, known)
-            raise EmulatorError(f"identifier.{option}: not an option of the algorithm {algorithm}{hint}")
-        allowed = tuple(kind for word, kinds in _KINDS.items() if word in known[option] for kind in kinds)
-        if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
-            raise EmulatorError(
-                f"identifier.{option}: must be {known[option].removesuffix(' | None')}, not {value!r}"
-            )
-
-
 def _with_upset(identifier: Identifier, upset: CatalogUpset) -> Identifier:
     """Return the identifier with one bit of a star's direction flipped; unchanged if it lacks the star."""
     rows = np.flatnonzero(identifier.stars.hip == upset.hip)
@@ -91,19 +64,6 @@ def _with_upset(identifier: Identifier, upset: CatalogUpset) -> Identifier:
     bits[upset.component] ^= np.uint32(1 << upset.bit)
     direction[upset.component] = bits.view(np.float32)[upset.component]
     return identifier.with_direction(int(rows[0]), direction)
-
-
-def _known_options(algorithm: type) -> dict[str, str]:
-    """Return the type of each option of an algorithm: keywords of its class, and fields of `options`."""
-    types = {name: str(item.annotation) for name, item in inspect.signature(algorithm).parameters.items()}
-    for held in get_args(get_type_hints(inspect.getattr_static(algorithm, "__init__")).get("options")):
-        if is_dataclass(held):
-            hints = get_type_hints(held)
-            types |= {
-                field.name: "str" if get_origin(hints[field.name]) is Literal else str(field.type)
-                for field in fields(held)
-            }
-    return {name: kind for name, kind in types.items() if any(word in kind for word in _KINDS)}
 
 
 class StarIdentifiers:

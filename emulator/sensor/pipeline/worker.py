@@ -8,6 +8,7 @@ import pickle
 import signal
 import socket
 import sys
+from contextlib import suppress
 from typing import Any, Final
 
 from starhil.emulator.sensor.pipeline.messages import LENGTH, Failure, with_length
@@ -29,7 +30,7 @@ def main() -> None:
 
 def serve_in_thread(link: socket.socket) -> None:
     """Serve the emulator, and report an unexpected end."""
-    with link:
+    with link, suppress(SystemExit):  # with which `_send` ends once the emulator has closed the socket
         try:
             serve(link)
         except BaseException as error:  # noqa: BLE001 (its pending requests must fail)

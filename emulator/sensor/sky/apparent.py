@@ -40,16 +40,16 @@ def _inverse_gamma(beta: Array) -> float:
 @compiled_ieee
 def apparent_stars(vectors: Array, parallax_rad: Array, position_au: Array, beta: Array) -> Array:
     """Return the directions (n, 3) of stars with parallax and aberration, as vectors of length 1 but for the parallax."""
-    seen = np.empty((len(vectors), 3))
+    directions = np.empty((len(vectors), 3))
     inverse_gamma = _inverse_gamma(beta)
-    for i in range(seen.shape[0]):
+    for i in range(directions.shape[0]):
         x, y, z = (
             vectors[i, 0] - parallax_rad[i] * position_au[0],
             vectors[i, 1] - parallax_rad[i] * position_au[1],
             vectors[i, 2] - parallax_rad[i] * position_au[2],
         )
-        _aberrate(x, y, z, beta, inverse_gamma, seen[i])
-    return seen
+        _aberrate(x, y, z, beta, inverse_gamma, directions[i])
+    return directions
 
 
 @compiled_ieee
@@ -69,10 +69,10 @@ def apparent_bodies(
     position, beta : ndarray (3,)
         Barycentric place of the observer, m, and velocity as a fraction of the speed of light.
     """
-    seen = np.empty((2 + planets.shape[0], 5))
+    bodies = np.empty((2 + planets.shape[0], 5))
     inverse_gamma = _inverse_gamma(beta)
     gap = np.empty(3)
-    for i in range(seen.shape[0]):
+    for i in range(bodies.shape[0]):
         for axis in range(3):
             if i < 2:
                 place = sun[axis] if i == 0 else moon[axis]
@@ -80,8 +80,8 @@ def apparent_bodies(
                 place = planets[i - 2, axis] + since_s * velocities[i - 2, axis]
             gap[axis] = place - position[axis]
         length = math.sqrt(gap[0] * gap[0] + gap[1] * gap[1] + gap[2] * gap[2])
-        direction = seen[i, 2:]
+        direction = bodies[i, 2:]
         _aberrate(gap[0] / length, gap[1] / length, gap[2] / length, beta, inverse_gamma, direction)
-        seen[i, 0] = math.degrees(math.atan2(direction[1], direction[0])) % 360.0
-        seen[i, 1] = math.degrees(math.atan2(direction[2], math.hypot(direction[0], direction[1])))
-    return seen
+        bodies[i, 0] = math.degrees(math.atan2(direction[1], direction[0])) % 360.0
+        bodies[i, 1] = math.degrees(math.atan2(direction[2], math.hypot(direction[0], direction[1])))
+    return bodies

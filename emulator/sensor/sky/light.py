@@ -102,12 +102,12 @@ class AreaLight:
 
     def seen_at(self, xy_px: Array) -> Array:
         """Return the transmission (n,) at positions (n, 2); outside the image that of its edge."""
-        seen = np.full(len(xy_px), 0.0 if self.flooded else 1.0)
+        transmission = np.full(len(xy_px), 0.0 if self.flooded else 1.0)
         if self._layers:
             nearest = np.clip(xy_px, 0.0, np.array(self.size) - 1.0)
             for layer in self._layers:
-                seen *= layer.seen_at(nearest)
-        return seen
+                transmission *= layer.seen_at(nearest)
+        return transmission
 
     @property
     def covered_share(self) -> float:
@@ -358,7 +358,6 @@ class AreaPainter:
         return [Patch(box, light, passed)]
 
     def _wide_earth(self, earth: EarthLimb, attitude: Attitude) -> WideEarth:
-        """Return the Earth on the grid."""
         nadir, sun = self._earth_and_sun(earth, attitude)
         directions = self._grid_directions
         grid = np.empty_like(directions)

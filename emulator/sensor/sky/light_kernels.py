@@ -25,12 +25,12 @@ NearGlare: TypeAlias = tuple[Box, Glare, Image, Image]
 @compiled_ieee
 def transmission_at(passed: Image, box: Box, xy_px: Array) -> Array:
     """Return the transmission (n,) of the pixels nearest to positions (n, 2); 1 outside the box."""
-    seen = np.ones(len(xy_px))
-    for i in range(seen.size):
+    transmission = np.ones(len(xy_px))
+    for i in range(transmission.size):
         row, column = int(np.rint(xy_px[i, 1])) - box[0], int(np.rint(xy_px[i, 0])) - box[2]
         if 0 <= row < passed.shape[0] and 0 <= column < passed.shape[1]:
-            seen[i] = passed[row, column]
-    return seen
+            transmission[i] = passed[row, column]
+    return transmission
 
 
 @compiled_ieee

@@ -5,10 +5,8 @@ All are plain values for profiles and tests; `starhil.emulator.sensor.sky.light`
 
 from __future__ import annotations
 
-import copy
-import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Self
@@ -16,7 +14,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
-from starhil.protocol.errors import remedy
+from starhil.emulator.simulation.limited import limited, listed
 from starid.arrays import Array
 
 _MAX_OBJECTS: Final = 100_000
@@ -30,11 +28,6 @@ SUN_V: Final = -26.74
 
 MAX_ROWS: Final = 200
 """Most planets, obstructions, or corners of an obstruction."""
-
-
-def limited(low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
-    """Return a field with its limits, and its default if it has one; whole numbers if the limits are."""
-    return dataclasses.field(default=default, metadata={"limits": (low, high)})
 
 
 def icrs_vector(ra_deg: float, dec_deg: float) -> Array:
@@ -125,6 +118,10 @@ class EarthLimb(CelestialBody):
     sun_dec_deg: float | None = limited(-90.0, 90.0, None)
     """Direction of the Sun, which lights the half of the Earth that faces it; by default all of the disc is lit."""
 
+    def __post_init__(self) -> None:
+        if (self.sun_ra_deg is None) != (self.sun_dec_deg is None):
+            raise EmulatorError("sun_ra_deg and sun_dec_deg belong together; give both or neither")
+
     @cached_property
     def sun_direction(self) -> Array | None:
         """Direction (3,) of the Sun that lights it, ICRS; None if all of the disc is lit."""
@@ -156,7 +153,7 @@ class Obstruction:
     """Fraction of the image beyond the edge, 0…1; not used with a polygon."""
     angle_deg: float = limited(-360.0, 360.0, 0.0)
     """Direction from the image to the covered side, 0 to the right, 90 down."""
-    polygon_px: tuple[tuple[float, float], ...] = limited(-1e5, 1e5, ())
+    polygon_px: tuple[tuple[float, float], ...] = limited(-1e5, 1e5, (), most=MAX_ROWS)
     """Corners, pixels; empty for an edge."""
     softness_px: float = limited(0.0, 1000.0, 3.0)
     """Blur of the out-of-focus outline, pixels."""
@@ -170,9 +167,9 @@ class SkyObjects:
     sun: SunGlare | None = None
     earth: EarthLimb | None = None
     """The bodies, if present."""
-    planets: tuple[PointSource, ...] = ()
+    planets: tuple[PointSource, ...] = listed(MAX_ROWS)
     """Point sources at fixed directions."""
-    obstructions: tuple[Obstruction, ...] = ()
+    obstructions: tuple[Obstruction, ...] = listed(MAX_ROWS)
     """Objects that cover parts of the image."""
     false_stars: int = limited(0, _MAX_OBJECTS, 0)
     """Number of false stars at random positions that change with every frame."""
@@ -180,6 +177,11 @@ class SkyObjects:
     """Number of false stars at random positions that stay the same during a run."""
     false_star_magnitudes: tuple[float, float] = limited(-5.0, 20.0, (1.0, 5.5))
     """Range of the magnitudes of false stars, brighter first; uniformly distributed."""
+    star_position_noise_px: float = limited(0.0, 100.0, 0.0)
+    """Standard deviation of a displacement of each star along each axis, random in every frame: the position noise with
+    which Özyurt's thesis tests its algorithms, in addition to the sensor's own noise."""
+    star_magnitude_noise: float = limited(0.0, 5.0, 0.0)
+    """The same of a change of each star's magnitude."""
     missing_stars: int = limited(0, _MAX_OBJECTS, 0)
     """Number of catalogue stars omitted, the brightest in the field."""
     cosmic_rays_s: float = limited(0.0, 1e6, 0.0)
@@ -188,47 +190,28 @@ class SkyObjects:
     """True if no light reaches the detector."""
 
     def __post_init__(self) -> None:
-        if self.earth is not None and (self.earth.sun_ra_deg is None) != (self.earth.sun_dec_deg is None):
-            raise EmulatorError("sky earth: sun_ra_deg and sun_dec_deg belong together; give both or neither")
-        for body in (self.moon, self.sun, self.earth, *self.planets, *self.obstructions):
-            if body is not None:
-                _check_fields(type(body).__name__, body)
-        _check_fields("SkyObjects", self)
         low, high = self.false_star_magnitudes
         if low > high:
-            raise EmulatorError(f"sky false_star_magnitudes: {low} to {high}; put the brighter one first")
+            raise EmulatorError(f"false_star_magnitudes: {low:g} to {high:g}; put the brighter one first")
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Make sky objects from the plain values of TOML or JSON.
+        """Make sky objects from a table that is valid (`starhil.emulator.sensor.sky.tables`).
 
         The keys are the fields of this class. Bodies are tables of their fields; `planets` and `obstructions`
         are lists of tables. `blocked_share` adds an obstruction with a straight edge.
         """
         fields = dict(values)
-        share = fields.pop("blocked_share", None)
-        for name, kind in (("moon", Moon), ("sun", SunGlare), ("earth", EarthLimb)):
+        share = fields.pop("blocked_share", 0.0)
+        for name, kind in BODY_KINDS.items():
             if fields.get(name) is not None:
-                fields[name] = _from_table(name, kind, fields[name])
-        for name, element in (("planets", PointSource), ("obstructions", Obstruction)):
-            rows = fields.get(name, ())
-            if not isinstance(rows, (list, tuple)):
-                raise EmulatorError(f"sky {name}: must be a list of tables")
-            _check_count(f"sky {name}", rows)
-            fields[name] = tuple(_from_table(name, element, row) for row in rows)
-        if share is not None and share != 0:
-            edge = _from_table("blocked_share", Obstruction, {"share": share})
-            fields["obstructions"] = (*fields["obstructions"], edge)
+                fields[name] = kind(**fields[name])
+        fields["planets"] = tuple(PointSource(**row) for row in fields.get("planets", ()))
+        edge = [Obstruction(share=share)] if share else []
+        fields["obstructions"] = (*(_obstruction(row) for row in fields.get("obstructions", ())), *edge)
         if "false_star_magnitudes" in fields:
-            fields["false_star_magnitudes"] = _pair("false_star_magnitudes", fields["false_star_magnitudes"])
-        objects: Self = _from_table("", cls, fields)
-        return objects
-
-    def with_computed(self, **fields: Any) -> Self:
-        """Return a copy with other values for some fields, computed ones whose ranges are not checked."""
-        changed = copy.copy(self)
-        changed.__dict__.update(fields)
-        return changed
+            fields["false_star_magnitudes"] = tuple(fields["false_star_magnitudes"])
+        return cls(**fields)
 
     @property
     def has_extended_objects(self) -> bool:
@@ -236,84 +219,10 @@ class SkyObjects:
         return bool(self.moon or self.sun or self.earth or self.obstructions or self.blank)
 
 
-def _check_count(where: str, rows: Sequence[object]) -> None:
-    """Reject a list that would make every image slow."""
-    if len(rows) > MAX_ROWS:
-        raise EmulatorError(f"{where}: must have at most {MAX_ROWS} items, not {len(rows)}")
+BODY_KINDS: Final[dict[str, type[CelestialBody]]] = {"moon": Moon, "sun": SunGlare, "earth": EarthLimb}
+"""Fields of `SkyObjects` that are bodies, and their classes."""
 
 
-def _pair(name: str, value: Any) -> tuple[float, float]:
-    """Return a list of two numbers as a tuple."""
-    if not isinstance(value, (list, tuple)) or len(value) != 2:
-        raise EmulatorError(f"sky {name}: must be two numbers, not {value!r}")
-    return (value[0], value[1])
-
-
-def check_keys(where: str, given: Iterable[str], known: Iterable[str], taken: Iterable[str] = ()) -> None:
-    """Reject an unknown key; the error suggests similar known ones, or lists all, with those `taken` already."""
-    unknown = sorted(set(given) - set(known))
-    if unknown:
-        raise EmulatorError(f"{where}: unknown key {unknown[0]!r}{remedy(unknown[0], {*known, *taken})}")
-
-
-def _from_table(name: str, kind: Any, values: Any) -> Any:
-    """Make an object of class `kind` from a table; an instance is returned unchanged."""
-    where = f"sky {name}".strip()
-    if isinstance(values, kind):
-        return values
-    if not isinstance(values, Mapping):
-        raise EmulatorError(f"{where}: must be a table, not {values!r}")
-    fields = {field.name: field for field in dataclasses.fields(kind)}
-    check_keys(where, values, fields, () if name else ("blocked_share",))
-    required = {key for key, field in fields.items() if field.default is dataclasses.MISSING}
-    missing = sorted(required - values.keys())
-    if missing:
-        raise EmulatorError(f"{where}: key {missing[0]!r} is missing")
-    arguments = dict(values)
-    if "polygon_px" in arguments:
-        if not isinstance(arguments["polygon_px"], (list, tuple)):
-            raise EmulatorError(f"{where}: polygon_px must be a list of corners [x, y]")
-        _check_count(f"{where}: polygon_px", arguments["polygon_px"])
-        arguments["polygon_px"] = tuple(_pair("polygon_px", corner) for corner in arguments["polygon_px"])
-    return kind(**arguments)
-
-
-def _flatten(value: Any) -> Iterator[Any]:
-    """Yield a value, or all values in nested tuples."""
-    if isinstance(value, tuple):
-        for element in value:
-            yield from _flatten(element)
-    else:
-        yield value
-
-
-def _check_fields(where: str, body: Any) -> None:
-    """Check types and ranges of an object's fields."""
-    for name, default, low, high, whole in _RULES[type(body)]:
-        value = getattr(body, name)
-        if type(value) is float and low <= value <= high and not whole:
-            continue
-        if type(default) is bool and not isinstance(value, bool):
-            raise EmulatorError(f"sky {where} {name}: must be true or false, not {value!r}")
-        if type(default) is str and not isinstance(value, str):
-            raise EmulatorError(f"sky {where} {name}: must be a string, not {value!r}")
-        if low > high or (value is None and default is None):
-            continue
-        for number in _flatten(value):
-            good = isinstance(number, int if whole else (int, float)) and not isinstance(number, bool)
-            if not good or not low <= number <= high:
-                kind = "a whole number" if whole else "a number"
-                raise EmulatorError(f"sky {where} {name}: must be {kind} {low:g}…{high:g}, not {number!r}")
-
-
-_NO_LIMITS: Final = (math.inf, -math.inf)
-
-_RULES: Final[dict[type, list[tuple[str, Any, float, float, bool]]]] = {
-    kind: [
-        (field.name, field.default, low, high, isinstance(low, int))
-        for field in dataclasses.fields(kind)
-        for low, high in (field.metadata.get("limits", _NO_LIMITS),)
-    ]
-    for kind in (Moon, SunGlare, EarthLimb, PointSource, Obstruction, SkyObjects)
-}
-"""Name, default and limits of each field of a class of objects, and whether it is a whole number."""
+def _obstruction(table: Mapping[str, Any]) -> Obstruction:
+    corners = tuple((x, y) for x, y in table.get("polygon_px", ()))
+    return Obstruction(**{**table, "polygon_px": corners})

@@ -5,9 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, Literal, TypeAlias
 
-from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.sky.ephemeris import (
     Observer,
     Vector,
@@ -17,20 +16,23 @@ from starhil.emulator.sensor.sky.ephemeris import (
     planets_seen_by,
     sun_seen_by,
 )
-from starhil.emulator.sensor.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare, check_keys
+from starhil.emulator.sensor.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
 
-BODIES: Final = ("typed", "ephemeris")
+BodySource: TypeAlias = Literal["typed", "ephemeris"]
 """Where Sun, Moon, Earth and planets are: only where they are typed in, or where the date puts them."""
 
-_PLACE: Final = {"ra_deg": 0.0, "dec_deg": 0.0}
+PLACE: Final = ("ra_deg", "dec_deg")
+"""Keys of a body's direction."""
+
+_ANYWHERE: Final = dict.fromkeys(PLACE, 0.0)
 _STYLES: Final[dict[str, Any]] = {
-    "sun": SunGlare(**_PLACE, exclusion_deg=30.0, reach_deg=90.0),
-    "moon": Moon(**_PLACE, reach_deg=90.0),
-    "earth": EarthLimb(**_PLACE),
+    "sun": SunGlare(**_ANYWHERE, exclusion_deg=30.0, reach_deg=90.0),
+    "moon": Moon(**_ANYWHERE, reach_deg=90.0),
+    "earth": EarthLimb(**_ANYWHERE),
 }
 """Defaults of the bodies that the date places."""
 
-_COMPUTED: Final = {
+COMPUTED: Final = {
     "sun": (),
     "moon": ("diameter_deg", "magnitude", "illuminated", "bright_limb_deg"),
     "earth": ("radius_deg", "atmosphere_deg", "sun_ra_deg", "sun_dec_deg"),
@@ -48,14 +50,14 @@ class SkyView:
 
 def has_aberration(values: Mapping[str, Any]) -> Any:
     """Return whether a table `[sky]` shows stars with aberration: its key `aberration`, else whether it has a date."""
-    return values.get("aberration", values.get("date") is not None or values.get("bodies") == BODIES[1])
+    return values.get("aberration", values.get("date") is not None or values.get("bodies") == "ephemeris")
 
 
 class Sky:
-    """The sky of a table `[sky]` in a profile: the fields of `SkyObjects`, and three more.
+    """The sky of a table `[sky]` in a profile (`starhil.emulator.sensor.sky.tables`): the fields of `SkyObjects`, and three more.
 
     - `date`: set if the stars are to be seen with aberration and parallax;
-    - `bodies`: one of `BODIES`; with `ephemeris`, a table `sun`, `moon` or `earth` with a direction replaces
+    - `bodies`: a `BodySource`; with `ephemeris`, a table `sun`, `moon` or `earth` with a direction replaces
       the body of the date;
     - `aberration`: false for stars without aberration and parallax all the same.
 
@@ -66,21 +68,14 @@ class Sky:
     def __init__(self, values: Mapping[str, Any]) -> None:
         fields = dict(values)
         fields.pop("date", None)
-        bodies = fields.pop("bodies", BODIES[0])
-        if bodies not in BODIES:
-            raise EmulatorError(f"sky bodies: must be {' or '.join(map(repr, BODIES))}, not {bodies!r}")
-        self.by_date = bodies == BODIES[1]
+        self.by_date = fields.pop("bodies", "typed") == "ephemeris"
         """Whether the date places Sun, Moon, Earth and planets."""
         self._moving = has_aberration(values)
         fields.pop("aberration", None)
-        if not isinstance(self._moving, bool):
-            raise EmulatorError(f"sky aberration: must be true or false, not {self._moving!r}")
         self._looks = {name: _look(fields.get(name)) for name in _STYLES}
         """Fields of bodies in the profile, without the directions: they also hold for bodies of the date and of faults."""
         self._styles = {
-            name: _styled(
-                name, style if self.by_date else type(style)(**_PLACE), fields, by_date=self.by_date
-            )
+            name: _styled(name, style if self.by_date else type(style)(**_ANYWHERE), fields)
             for name, style in _STYLES.items()
         }
         self._fields = fields
@@ -125,28 +120,19 @@ class Sky:
             moon = moon_seen_by(observer, self._styles["moon"])
             if not hidden_by(earth, moon):
                 changes["moon"] = moon
-        return objects.with_computed(**changes)
+        return dataclasses.replace(objects, **changes)
 
 
 def _look(table: Any) -> dict[str, Any]:
     """Return the fields of a body's table except its direction."""
     fields = table if isinstance(table, Mapping) else {}
-    return {key: value for key, value in fields.items() if key not in _PLACE}
+    return {key: value for key, value in fields.items() if key not in PLACE}
 
 
-def _styled(name: str, style: Any, fields: dict[str, Any], *, by_date: bool) -> Any:
+def _styled(name: str, style: Any, fields: dict[str, Any]) -> Any:
     """Return the defaults of a body, changed by its table if that has no direction; the table is then removed."""
     table = fields.get(name)
-    if not isinstance(table, Mapping) or not table.keys().isdisjoint(_PLACE):
+    if table is None or not table.keys().isdisjoint(PLACE):
         return style
-    computed = [key for key in _COMPUTED[name] if key in table]
-    if computed and by_date:
-        raise EmulatorError(
-            f"sky {name}: {computed[0]} follows from the date; leave it out, or give ra_deg and dec_deg"
-        )
     del fields[name]
-    place = dataclasses.asdict(style)
-    check_keys(f"sky {name}", table, place)
-    changed = dataclasses.replace(style, **table)
-    SkyObjects(**{name: changed})
-    return changed
+    return dataclasses.replace(style, **table)

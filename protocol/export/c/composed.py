@@ -67,7 +67,7 @@ def link_parts(stack: SerialStack) -> tuple[str, str, str]:
 
 def _constants(stack: SerialStack) -> dict[str, str]:
     """Return the declarations of the constants that the code uses, by name."""
-    found = {
+    constants = {
         "START_SIZE": f"static const size_t START_SIZE = {len(stack.requests.framing.start)}u;",
         "END_SIZE": f"static const size_t END_SIZE = {len(stack.requests.framing.end)}u;",
         "CHECK_SIZE": f"static const size_t CHECK_SIZE = {stack.requests.check.size}u;",
@@ -95,13 +95,13 @@ def _constants(stack: SerialStack) -> dict[str, str]:
             "CRC_BITS": bits, "CRC_MASK": (1 << bits) - 1, "CRC_REFLECTED": int(stack.link.check.reflect),
             "CRC_POLYNOMIAL": reversed_bits(poly, bits) if stack.link.check.reflect else poly,
         }  # fmt: skip
-    return found | {name: f"#define {name} {_number(value)}" for name, value in macros.items()}
+    return constants | {name: f"#define {name} {_number(value)}" for name, value in macros.items()}
 
 
 def _rows(stack: SerialStack) -> dict[str, Any]:
     """Return the functions of a row's key: tests of its kind, and its sizes."""
-    rows = {row_key(stack.classes, row.klass, row.id): row for row in stack.rows}
-    headers = {key: stack.requests.header.size(row.klass) for key, row in rows.items()}
+    rows = {row_key(stack.classes, row.message_class, row.id): row for row in stack.rows}
+    headers = {key: stack.requests.header.size(row.message_class) for key, row in rows.items()}
     requests = {key: headers[key] + row.request_size + stack.requests.check.size for key, row in rows.items()}
     return {
         "tests": {

@@ -102,7 +102,7 @@ def _fields(header: HeaderCodec, codes: Mapping[str, int]) -> Iterator[dict[str,
 def _rows(stack: SerialStack) -> Iterator[tuple[int, dict[str, Any]]]:
     for row in stack.rows:
         yield (
-            row_key(stack.classes, row.klass, row.id),
+            row_key(stack.classes, row.message_class, row.id),
             {
                 "telemetry": row.kind == "telemetry",
                 "request_size": row.request_size,

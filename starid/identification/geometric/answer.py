@@ -123,14 +123,14 @@ def test_and_refine(
         index, raw.params, observed, rotation, numbers[SCALE], faintest, settings, odds, order, used
     ):
         return 0, 0.0
-    seen = observed.copy() if directions_depend_on_solution(settings) else observed
+    detections = observed.copy() if directions_depend_on_solution(settings) else observed
     matched = refine(
         index,
         raw,
         observed,
         settings,
         min_matched,
-        seen,
+        detections,
         rotation,
         candidate.stars,
         candidate.normal,
@@ -141,7 +141,7 @@ def test_and_refine(
     if abs(math.log(numbers[SCALE])) > 1.5 * settings.scale_tolerance:
         return 0, 0.0
     bound = log_false_probability(
-        index, seen, rotation, candidate.stars, matched, candidate.normal, numbers, settings, prior
+        index, detections, rotation, candidate.stars, matched, candidate.normal, numbers, settings, prior
     )
     return matched, bound
 
@@ -217,7 +217,7 @@ def make_answer(
     for axis in range(3):
         for k in range(3):
             unit[k] = variance if k == axis else 0.0
-        solve_symmetric(candidate.normal, unit, 3, column)
+        solve_symmetric(candidate.normal, unit, covariance.shape[0], column)
         for k in range(3):
             covariance[k, axis] = column[k]
     quaternion_of(candidate.frames[2], quaternion)

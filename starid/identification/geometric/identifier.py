@@ -11,8 +11,7 @@ import functools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,12 +35,11 @@ from starid.identification.geometric.search import identify_kernel
 from starid.identification.geometric.settings import ACCEPTED, SETTINGS, TOO_FEW
 from starid.identification.geometric.tracking import MIN_TRACKED, MIN_TRACKED_KNOWN, track_kernel
 from starid.identification.geometric.verification import WHOLE_SKY
+from starid.identification.options import GeometricOptions
 from starid.identification.single_camera import CheckedDetections, SingleCameraIdentifier, near
 from starid.identification.solution import Mode, Reason, Solution
 
-BLEND_PX: Final = 2.0
 TRACKING_WINDOW_PX: Final = 20.0
-WIDEST_TOLERANCE: Final = 0.3
 MAX_PART_STARS: Final = 30
 _QUICK_TRIANGLES: Final = 60
 """Number of triangles tried at each focal length before any full search."""
@@ -120,18 +118,14 @@ class Identifier(SingleCameraIdentifier):
         The camera that took the images.
     catalog : StarCatalog, optional
         By default all of Hipparcos at its default epoch.
-    limiting_magnitude : float, optional
-        Faintest V in the index; by default some 200 stars per field, at least V 6.
-    fov_tolerance : float
-        Relative uncertainty of the focal length, 0 for a calibrated camera. If not 0, solutions refine it.
-    blend_px : float
-        Stars closer than this are merged, pixels.
+    options : GeometricOptions, optional
+        By default `GeometricOptions()`.
     effort : Effort
         Bounds of the search.
     index_camera : Camera, optional
         Camera whose index is used, so that similar cameras share one; by default the camera itself.
-    cache : bool or path
-        Whether the index is kept in the cache folder, or the folder to keep it in.
+    **changes
+        Fields of `GeometricOptions` to change.
 
     Raises
     ------
@@ -143,30 +137,28 @@ class Identifier(SingleCameraIdentifier):
         self,
         camera: Camera = DEFAULT_CAMERA,
         catalog: StarCatalog | None = None,
+        options: GeometricOptions | None = None,
         *,
-        limiting_magnitude: float | None = None,
-        fov_tolerance: float = 0.0,
-        blend_px: float = BLEND_PX,
         effort: Effort | None = None,
         index_camera: Camera | None = None,
-        cache: bool | str | Path = True,
+        **changes: Any,
     ) -> None:
-        if not 0.0 <= fov_tolerance <= WIDEST_TOLERANCE:
-            raise StaridError(
-                f"identifier fov_tolerance: must be 0…{WIDEST_TOLERANCE:g}, not {fov_tolerance}"
-            )
+        options = dataclasses.replace(options or GeometricOptions(), **changes)
         super().__init__(camera, catalog)
         if len(self._catalog) == 0:
             raise StaridError("identifier catalog: contains no stars")
         effort = effort or Effort()
         typical = camera if index_camera is None else index_camera
+        limiting_magnitude = options.limiting_magnitude
         if limiting_magnitude is None:
             limiting_magnitude = default_limiting_magnitude(self._catalog, field_solid_angle(typical))
-        settings = index_settings(typical, self._catalog, limiting_magnitude, blend_px, effort.window_px)
-        self._stars = obtain_stars(self._catalog, settings, cache)
+        settings = index_settings(
+            typical, self._catalog, limiting_magnitude, options.blend_px, effort.window_px
+        )
+        self._stars = obtain_stars(self._catalog, settings, options.cache)
         self._rows = self._catalog.index_of(self._stars.hip).astype(np.int64)
-        self._set_index(obtain_index(self._stars, settings, cache))
-        self._configure(camera, fov_tolerance, effort)
+        self._set_index(obtain_index(self._stars, settings, options.cache))
+        self._configure(camera, options.fov_tolerance, effort)
 
     def _set_index(self, index: IndexArrays) -> None:
         self._index = index
@@ -202,7 +194,7 @@ class Identifier(SingleCameraIdentifier):
     def _search(self, camera: Camera, measured: CheckedDetections, numbers: Records) -> Answer:
         """Search the whole sky with a given camera and kernel settings."""
         detections = measured.xy, measured.flux, measured.sigmas
-        return self._identify_kernel(camera.params, *detections, numbers)
+        return self._identify_kernel(camera.params, *detections, numbers, MIN_MATCHED, WHOLE_SKY)
 
     def _numbers_for(self, measured: CheckedDetections) -> Records:
         """Kernel settings for one call."""

@@ -37,7 +37,7 @@ def find_triangles(
     hand: int,
     tolerance: float,
     spread: float,
-    found: Indices,
+    patterns: Indices,
 ) -> int:
     """Find index triangles with given sides (longest first) within a tolerance; return their number.
 
@@ -74,8 +74,8 @@ def find_triangles(
                         continue
                 elif p1 < least1 or p1 > most1:
                     continue
-                found[count] = pattern
+                patterns[count] = pattern
                 count += 1
-                if count == found.shape[0]:
+                if count == patterns.shape[0]:
                     return count
     return count

@@ -48,17 +48,17 @@ def to_sky(rotation: Array, seen: Table, i: int) -> tuple[float, float, float]:
 
 @inner
 def residual(
-    star_table: Array, seen: Table, rotation: Array, i: int, star: int
+    star_table: Array, detections: Table, rotation: Array, i: int, star: int
 ) -> tuple[float, float, float, float, float]:
     """Residual of detection i along the axes of its error, pixels, and the star's direction in the sensor frame."""
     a, b, c = star_table[star, 0], star_table[star, 1], star_table[star, 2]
     x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c
     y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c
     z = rotation[2, 0] * a + rotation[2, 1] * b + rotation[2, 2] * c
-    dx, dy, dz = seen[i, X] - x, seen[i, Y] - y, seen[i, Z] - z
+    dx, dy, dz = detections[i, X] - x, detections[i, Y] - y, detections[i, Z] - z
     return (
-        seen[i, U_X] * dx + seen[i, U_Y] * dy + seen[i, U_Z] * dz,
-        seen[i, V_X] * dx + seen[i, V_Y] * dy + seen[i, V_Z] * dz,
+        detections[i, U_X] * dx + detections[i, U_Y] * dy + detections[i, U_Z] * dz,
+        detections[i, V_X] * dx + detections[i, V_Y] * dy + detections[i, V_Z] * dz,
         x,
         y,
         z,
@@ -68,7 +68,7 @@ def residual(
 @inner
 def _best_star(
     index: IndexArrays,
-    seen: Table,
+    detections: Table,
     rotation: Array,
     i: int,
     windows: tuple[float, float, float, float],
@@ -81,11 +81,14 @@ def _best_star(
     error_u, error_v = reach / WINDOW_SIGMAS, reach / WINDOW_SIGMAS
     if reach == BY_NOISE:
         least = SMALLEST_WINDOW_PX / WINDOW_SIGMAS
-        error_u, error_v = max(sigma * seen[i, SIGMA_U], least), max(sigma * seen[i, SIGMA_V], least)
+        error_u, error_v = (
+            max(sigma * detections[i, SIGMA_U], least),
+            max(sigma * detections[i, SIGMA_V], least),
+        )
         reach = WINDOW_SIGMAS * max(error_u, error_v)
     limit = min(reach / px_per_rad, index.numbers[GRID_MARGIN])
-    x, y, z = to_sky(rotation, seen, i)
-    expected = seen[i, MAGNITUDE] + zero_point
+    x, y, z = to_sky(rotation, detections, i)
+    expected = detections[i, MAGNITUDE] + zero_point
     cell = cell_of(x, y, z, int(index.numbers[GRID_CELLS]))
     best, best_cost = -1, math.inf
     for entry in range(grid_start[cell], grid_start[cell + 1]):
@@ -96,7 +99,7 @@ def _best_star(
         dx, dy, dz = star_table[star, 0] - x, star_table[star, 1] - y, star_table[star, 2] - z
         if deviation < -gate or dx * dx + dy * dy + dz * dz > limit * limit:
             continue
-        r0, r1, _, _, _ = residual(star_table, seen, rotation, i, star)
+        r0, r1, _, _, _ = residual(star_table, detections, rotation, i, star)
         distance2 = (r0 / error_u) ** 2 + (r1 / error_v) ** 2
         cost = distance2 + (deviation / scatter) ** 2
         if distance2 <= WINDOW_SIGMAS * WINDOW_SIGMAS and cost < best_cost:
@@ -107,7 +110,7 @@ def _best_star(
 @inner
 def match_detections(
     index: IndexArrays,
-    seen: Table,
+    detections: Table,
     rotation: Array,
     excluded: Mask,
     windows: tuple[float, float, float, float],
@@ -144,7 +147,7 @@ def match_detections(
     for i in range(stars.shape[0]):
         if excluded[i]:
             continue
-        best, best_cost = _best_star(index, seen, rotation, i, windows, zero_point, scatter)
+        best, best_cost = _best_star(index, detections, rotation, i, windows, zero_point, scatter)
         if best < 0:
             continue
         slot = (best * 40503) & mask

@@ -26,6 +26,7 @@ from starid.camera.projection import (
     undistort,
 )
 from starid.kernels.jit import inner
+from starid.kernels.small_arrays import zero
 
 Table = Array
 
@@ -139,7 +140,7 @@ def observe(raw: Raw) -> Table:
     order = by_decreasing_flux(raw.flux)
     params, xy, flux, sigmas = raw.params, raw.xy, raw.flux, raw.sigmas
     table = np.empty((flux.shape[0], COLUMNS))
-    n = 0
+    n = zero()
     for row in order:
         if not fill_direction(params, 1.0, xy[row, 0], xy[row, 1], table, n):
             continue
@@ -154,19 +155,19 @@ def observe(raw: Raw) -> Table:
 
 
 @inner
-def observe_scaled(raw: Raw, observed: Table, scale: float, seen: Table) -> None:
-    """Fill `seen` with the same detections for a focal length divided by `scale`.
+def observe_scaled(raw: Raw, observed: Table, scale: float, detections: Table) -> None:
+    """Fill `detections` with the same detections for a focal length divided by `scale`.
 
     A detection outside the image circle gets a direction of length `NOWHERE`, far from any star.
     """
     for i in range(observed.shape[0]):
         for column in range(COLUMNS):
-            seen[i, column] = observed[i, column]
+            detections[i, column] = observed[i, column]
         row = int(np.int64(observed[i, SOURCE]))
-        if not fill_direction(raw.params, scale, raw.xy[row, 0], raw.xy[row, 1], seen, i):
-            seen[i, X], seen[i, Y], seen[i, Z] = 0.0, 0.0, NOWHERE
+        if not fill_direction(raw.params, scale, raw.xy[row, 0], raw.xy[row, 1], detections, i):
+            detections[i, X], detections[i, Y], detections[i, Z] = 0.0, 0.0, NOWHERE
             continue
-        _to_error_axes(raw.sigmas[row, 2], U_X, V_X, 3, seen, i)
+        _to_error_axes(raw.sigmas[row, 2], U_X, V_X, 3, detections, i)
 
 
 @inner
@@ -188,16 +189,16 @@ def without_aberration(
 
 @inner
 def remove_aberration(
-    observed: Table, beta: tuple[float, float, float], rotation: Array, seen: Table
+    observed: Table, beta: tuple[float, float, float], rotation: Array, detections: Table
 ) -> None:
-    """Fill `seen` with the directions of `observed`, corrected for aberration at an ICRS→sensor matrix."""
+    """Fill `detections` with the directions of `observed`, corrected for aberration at an ICRS→sensor matrix."""
     bx = rotation[0, 0] * beta[0] + rotation[0, 1] * beta[1] + rotation[0, 2] * beta[2]
     by = rotation[1, 0] * beta[0] + rotation[1, 1] * beta[1] + rotation[1, 2] * beta[2]
     bz = rotation[2, 0] * beta[0] + rotation[2, 1] * beta[1] + rotation[2, 2] * beta[2]
-    for i in range(seen.shape[0]):
+    for i in range(detections.shape[0]):
         x, y, z = observed[i, X], observed[i, Y], observed[i, Z]
         if x * x + y * y + z * z > NOWHERE:
-            seen[i, X], seen[i, Y], seen[i, Z] = without_aberration(x, y, z, bx, by, bz)
+            detections[i, X], detections[i, Y], detections[i, Z] = without_aberration(x, y, z, bx, by, bz)
 
 
 @inner

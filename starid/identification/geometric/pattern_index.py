@@ -305,12 +305,12 @@ def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
         raise StaridError(
             f"index: {pattern_stars.size} pattern stars, at most {SIDE_STEPS} fit; the field is too narrow"
         )
-    chosen = np.ascontiguousarray(vectors[pattern_stars])
-    start, neighbours = _adjacency(chosen, settings.bright_sides_rad[1])
+    star_vectors = np.ascontiguousarray(vectors[pattern_stars])
+    start, neighbours = _adjacency(star_vectors, settings.bright_sides_rad[1])
     bright_sides, deep_sides = _chords(settings.bright_sides_rad), _chords(settings.deep_sides_rad)
     bins = settings.side_bins
     bright = np.isin(pattern_stars, bright_stars)
-    patterns, binned = _triangles(chosen, start, neighbours, bright, bright_sides, deep_sides, bins)
+    patterns, binned = _triangles(star_vectors, start, neighbours, bright, bright_sides, deep_sides, bins)
     if binned.size == 0:
         raise StaridError(
             f"index: no triangle of stars to V {settings.limiting_magnitude:g} fits the field; "

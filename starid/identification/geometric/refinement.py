@@ -37,7 +37,7 @@ from starid.identification.geometric.observation import (
 from starid.identification.geometric.pattern_index import STAR_MAGNITUDE, IndexArrays
 from starid.identification.geometric.settings import Settings
 from starid.kernels.jit import inner
-from starid.kernels.small_arrays import lower_median
+from starid.kernels.small_arrays import lower_median, zero
 
 MAX_ROUNDS: Final = 12
 """Largest number of rounds of matching and solving."""
@@ -120,23 +120,23 @@ def solve_symmetric(matrix: Array, right: Array, size: int, solution: Array) -> 
 
 
 @inner
-def _slopes(seen: Table, i: int, x: float, y: float, z: float, slopes: Array) -> None:
+def _slopes(detections: Table, i: int, x: float, y: float, z: float, slopes: Array) -> None:
     """Fill (2, 4) with the derivatives of the predicted position of detection i by rotation and scale.
 
     A rotation v of the sensor moves it by G (c × v), where c = (x, y, z) is the star in the sensor frame; a
     larger scale, that is, a shorter focal length, moves it towards the centre.
     """
-    ux, uy, uz = seen[i, U_X], seen[i, U_Y], seen[i, U_Z]
-    vx, vy, vz = seen[i, V_X], seen[i, V_Y], seen[i, V_Z]
+    ux, uy, uz = detections[i, U_X], detections[i, U_Y], detections[i, U_Z]
+    vx, vy, vz = detections[i, V_X], detections[i, V_Y], detections[i, V_Z]
     slopes[0, 0], slopes[0, 1], slopes[0, 2] = uy * z - uz * y, uz * x - ux * z, ux * y - uy * x
     slopes[1, 0], slopes[1, 1], slopes[1, 2] = vy * z - vz * y, vz * x - vx * z, vx * y - vy * x
-    slopes[0, 3], slopes[1, 3] = -seen[i, OFFSET_U], -seen[i, OFFSET_V]
+    slopes[0, 3], slopes[1, 3] = -detections[i, OFFSET_U], -detections[i, OFFSET_V]
 
 
 @inner
 def _outlier(
     star_table: Array,
-    seen: Table,
+    detections: Table,
     rotation: Array,
     stars: Indices,
     normal: Array,
@@ -150,8 +150,8 @@ def _outlier(
     this drop to the remaining χ² is F(2, ν − 2)-distributed, with the tail ``(1 + 2F/(ν − 2))^(1 − ν/2)``.
     """
     rest = float(freedom - 2)
-    known = PRIOR_FREEDOM if settings.sigmas_known else 0.0
-    if rest + known < 1.0:
+    prior_freedom = PRIOR_FREEDOM if settings.sigmas_known else 0.0
+    if rest + prior_freedom < 1.0:
         return -1
     unknowns = 4 if settings.scale_tolerance > 0.0 else 3
     slopes, unit, column = np.empty((2, 4)), np.empty(4), np.empty(4)
@@ -159,9 +159,9 @@ def _outlier(
     for i in range(stars.shape[0]):
         if stars[i] < 0:
             continue
-        r0, r1, x, y, z = residual(star_table, seen, rotation, i, stars[i])
-        _slopes(seen, i, x, y, z, slopes)
-        su, sv = seen[i, SIGMA_U], seen[i, SIGMA_V]
+        r0, r1, x, y, z = residual(star_table, detections, rotation, i, stars[i])
+        _slopes(detections, i, x, y, z, slopes)
+        su, sv = detections[i, SIGMA_U], detections[i, SIGMA_V]
         r0, r1 = r0 / su, r1 / sv
         for k in range(4):
             slopes[0, k] /= su
@@ -179,8 +179,8 @@ def _outlier(
         if not determinant > 1e-9:
             continue
         drop = (h11 * r0 * r0 - 2.0 * h01 * r0 * r1 + h00 * r1 * r1) / determinant
-        others = max(chi2 - drop, 0.0) + known
-        tail = (1.0 + drop / max(others, 1e-12)) ** (-0.5 * (rest + known))
+        others = max(chi2 - drop, 0.0) + prior_freedom
+        tail = (1.0 + drop / max(others, 1e-12)) ** (-0.5 * (rest + prior_freedom))
         if tail < least:
             worst, least = i, tail
     return worst
@@ -189,7 +189,7 @@ def _outlier(
 @inner
 def normal_equations(
     star_table: Array,
-    seen: Table,
+    detections: Table,
     rotation: Array,
     stars: Indices,
     unknowns: int,
@@ -209,9 +209,9 @@ def normal_equations(
     for i in range(stars.shape[0]):
         if stars[i] < 0:
             continue
-        r0, r1, x, y, z = residual(star_table, seen, rotation, i, stars[i])
-        _slopes(seen, i, x, y, z, slopes)
-        weight_u, weight_v = 1.0 / seen[i, SIGMA_U] ** 2, 1.0 / seen[i, SIGMA_V] ** 2
+        r0, r1, x, y, z = residual(star_table, detections, rotation, i, stars[i])
+        _slopes(detections, i, x, y, z, slopes)
+        weight_u, weight_v = 1.0 / detections[i, SIGMA_U] ** 2, 1.0 / detections[i, SIGMA_V] ** 2
         chi2 += weight_u * r0 * r0 + weight_v * r1 * r1
         for a in range(unknowns):
             at_u, at_v = weight_u * slopes[0, a], weight_v * slopes[1, a]
@@ -225,12 +225,12 @@ def normal_equations(
 
 
 @inner
-def photometry(star_table: Array, seen: Table, stars: Indices, scratch: Array) -> tuple[float, float]:
+def photometry(star_table: Array, detections: Table, stars: Indices, scratch: Array) -> tuple[float, float]:
     """Robust zero point (catalogue minus instrumental magnitude) of the matches, and its scatter."""
-    m = 0
+    m = zero()
     for i in range(stars.shape[0]):
         if stars[i] >= 0:
-            scratch[m] = star_table[stars[i], STAR_MAGNITUDE] - seen[i, MAGNITUDE]
+            scratch[m] = star_table[stars[i], STAR_MAGNITUDE] - detections[i, MAGNITUDE]
             m += 1
     zero_point = lower_median(scratch, m)
     for k in range(m):
@@ -241,15 +241,15 @@ def photometry(star_table: Array, seen: Table, stars: Indices, scratch: Array) -
 
 @inner
 def distances(
-    star_table: Array, seen: Table, rotation: Array, stars: Indices, scratch: Array
+    star_table: Array, detections: Table, rotation: Array, stars: Indices, scratch: Array
 ) -> tuple[float, float]:
     """Noise for unit error, from the median distance of the matches (Rayleigh); their RMS distance, px."""
-    m = 0
+    m = zero()
     total = 0.0
     for i in range(stars.shape[0]):
         if stars[i] >= 0:
-            r0, r1, _, _, _ = residual(star_table, seen, rotation, i, stars[i])
-            scratch[m] = math.sqrt((r0 / seen[i, SIGMA_U]) ** 2 + (r1 / seen[i, SIGMA_V]) ** 2)
+            r0, r1, _, _, _ = residual(star_table, detections, rotation, i, stars[i])
+            scratch[m] = math.sqrt((r0 / detections[i, SIGMA_U]) ** 2 + (r1 / detections[i, SIGMA_V]) ** 2)
             total += r0 * r0 + r1 * r1
             m += 1
     return lower_median(scratch, m) / _RAYLEIGH_MEDIAN, math.sqrt(total / max(m, 1))
@@ -272,7 +272,7 @@ def _marginalise(normal: Array, scratch: Array) -> float:
 
     Returns the marginal variance of the logarithm of the scale.
     """
-    solve_symmetric(normal, normal[3], 3, scratch)
+    solve_symmetric(normal, normal[3], normal.shape[0] - 1, scratch)
     weight = normal[3, 3]
     for a in range(3):
         weight -= normal[3, a] * scratch[a]
@@ -295,14 +295,16 @@ def _observer_moves(settings: Settings) -> bool:
 
 @inner
 def _observe_with(
-    raw: Raw, observed: Table, settings: Settings, rotation: Array, scale: float, seen: Table
+    raw: Raw, observed: Table, settings: Settings, rotation: Array, scale: float, detections: Table
 ) -> None:
-    """Fill `seen` with the detections for the refined scale, corrected for aberration."""
+    """Fill `detections` with the detections for the refined scale, corrected for aberration."""
     if settings.scale_tolerance > 0.0:
-        observe_scaled(raw, observed, scale, seen)
+        observe_scaled(raw, observed, scale, detections)
     if _observer_moves(settings):
         beta = (settings.beta_x, settings.beta_y, settings.beta_z)
-        remove_aberration(seen if settings.scale_tolerance > 0.0 else observed, beta, rotation, seen)
+        remove_aberration(
+            detections if settings.scale_tolerance > 0.0 else observed, beta, rotation, detections
+        )
 
 
 @inner
@@ -327,7 +329,7 @@ def refine(
     observed: Table,
     settings: Settings,
     min_matched: int,
-    seen: Table,
+    detections: Table,
     rotation: Array,
     stars: Indices,
     normal: Array,
@@ -341,7 +343,7 @@ def refine(
         The detections from the caller, and the same sorted (`observe`).
     min_matched : int
         The refinement fails with fewer matches.
-    seen : Table
+    detections : Table
         Where `directions_depend_on_solution`, a copy of `observed`, filled with the detections for the
         refined focal length and attitude; otherwise `observed`.
     rotation : ndarray (3, 3)
@@ -370,19 +372,19 @@ def refine(
     unknowns = 4 if free_scale else 3
     if _observer_moves(settings):
         _rotate_by_aberration(settings, rotation)
-    _observe_with(raw, observed, settings, rotation, numbers[SCALE], seen)
+    _observe_with(raw, observed, settings, rotation, numbers[SCALE], detections)
     gate, numbers[SCATTER] = settings.magnitude_gate, settings.magnitude_gate
     reach, sigma = settings.window, 1.0
     matched = 0
     for number in range(MAX_ROUNDS):
         matched = match_detections(
-            index, seen, rotation, excluded, (reach, sigma, gate, settings.px_per_rad),
+            index, detections, rotation, excluded, (reach, sigma, gate, settings.px_per_rad),
             numbers[ZERO_POINT], numbers[SCATTER], stars, costs, owners,
         )  # fmt: skip
         if matched < min_matched:
             return 0
         stable = _same(stars, previous) and number > 0
-        chi2 = normal_equations(star_table, seen, rotation, stars, unknowns, normal, right)
+        chi2 = normal_equations(star_table, detections, rotation, stars, unknowns, normal, right)
         if not solve_symmetric(normal, right, unknowns, step):
             return 0
         for k in range(unknowns):
@@ -390,24 +392,24 @@ def refine(
         rotate_sensor(rotation, step[0], step[1], step[2])
         if free_scale:
             numbers[SCALE] *= math.exp(step[3])
-        _observe_with(raw, observed, settings, rotation, numbers[SCALE], seen)
+        _observe_with(raw, observed, settings, rotation, numbers[SCALE], detections)
         freedom = max(2 * matched - unknowns, 1)
         numbers[VARIANCE] = max(chi2, 1e-12) / freedom
         if stable:
             worst = -1
             if matched <= FEW_MATCHED:
-                worst = _outlier(star_table, seen, rotation, stars, normal, chi2, freedom, settings)
+                worst = _outlier(star_table, detections, rotation, stars, normal, chi2, freedom, settings)
             if worst < 0:
                 break
             excluded[worst] = True
         sigma = math.sqrt(numbers[VARIANCE])
         if number == 0:
             # robust estimates, because the first matches may be wrong
-            sigma, _ = distances(star_table, seen, rotation, stars, scratch)
+            sigma, _ = distances(star_table, detections, rotation, stars, scratch)
             sigma *= math.sqrt(2.0 * matched / freedom)
-            numbers[ZERO_POINT], numbers[SCATTER] = photometry(star_table, seen, stars, scratch)
+            numbers[ZERO_POINT], numbers[SCATTER] = photometry(star_table, detections, stars, scratch)
             gate = min(gate, max(5.0 * numbers[SCATTER], MIN_GATE))
             reach = BY_NOISE
-    _, numbers[RMS] = distances(star_table, seen, rotation, stars, scratch)
+    _, numbers[RMS] = distances(star_table, detections, rotation, stars, scratch)
     numbers[SCALE_VARIANCE] = _marginalise(normal, scratch) if free_scale else 0.0
     return matched

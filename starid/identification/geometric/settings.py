@@ -63,4 +63,3 @@ SETTINGS: Final = record_type(Settings)
 NOTHING: Final = 0
 ACCEPTED: Final = 1
 TOO_FEW: Final = 2
-"""Status of an answer."""

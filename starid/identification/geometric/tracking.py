@@ -43,7 +43,7 @@ from starid.identification.geometric.sky_grid import cell_of
 from starid.identification.geometric.verification import hit_odds, test_order
 from starid.kernels.jit import compiled_ieee, inner
 
-PAIRED: Final = 16
+PAIRED_DETECTIONS: Final = 16
 """Number of detections, brightest first, that form pairs."""
 
 CANDIDATES: Final = 6
@@ -58,7 +58,7 @@ MIN_TRACKED_KNOWN: Final = 2
 
 @inner
 def _stars_near(
-    index: IndexArrays, x: float, y: float, z: float, window_rad: float, found: Indices, row: int
+    index: IndexArrays, x: float, y: float, z: float, window_rad: float, near_stars: Indices, row: int
 ) -> int:
     """Fill a row with the brightest stars within a window around a direction; return their number."""
     stars = index.stars
@@ -75,9 +75,9 @@ def _stars_near(
         star = int(np.int64(index.grid_stars[entry])) if listed else entry
         dx, dy, dz = stars[star, 0] - x, stars[star, 1] - y, stars[star, 2] - z
         if dx * dx + dy * dy + dz * dz < window_rad * window_rad:
-            found[row, count] = star
+            near_stars[row, count] = star
             count += 1
-            if count == found.shape[1]:
+            if count == near_stars.shape[1]:
                 break
     return count
 
@@ -181,7 +181,7 @@ def track_kernel(
     xy: Array,
     flux: Array,
     sigmas: Array,
-    given: Records,
+    records: Records,
     predicted: Array,
     window_rad: float,
     min_matched: int,
@@ -191,7 +191,7 @@ def track_kernel(
 
     Parameters
     ----------
-    given : ndarray (1,) of SETTINGS
+    records : ndarray (1,) of SETTINGS
     predicted : ndarray (3, 3)
         ICRS→sensor.
     window_rad : float
@@ -202,16 +202,16 @@ def track_kernel(
         See `starid.identification.geometric.verification.log_false_probability`.
     """
     raw = Raw(params, xy, flux, sigmas)
-    settings: Settings = given[0]
+    settings: Settings = records[0]
     observed = observe(raw)
     n = observed.shape[0]
     candidate, best, bounds = new_candidate(n), new_candidate(n), np.zeros(2)
     best.stars[:] = -1
     tests = (hit_odds(index, settings.test_window), test_order(n))
-    near = np.empty((PAIRED, CANDIDATES), dtype=np.int64)
-    counts = np.zeros(PAIRED, dtype=np.int64)
+    near = np.empty((PAIRED_DETECTIONS, CANDIDATES), dtype=np.int64)
+    counts = np.zeros(PAIRED_DETECTIONS, dtype=np.int64)
     status, bound, work = TOO_FEW if n < min_matched else NOTHING, 0.0, np.zeros(2, dtype=np.int64)
-    for j in range(min(n, PAIRED) if status == NOTHING else 0):
+    for j in range(min(n, PAIRED_DETECTIONS) if status == NOTHING else 0):
         x, y, z = without_aberration(
             *to_sky(predicted, observed, j), settings.beta_x, settings.beta_y, settings.beta_z
         )

@@ -196,7 +196,7 @@ def _stars_per_magnitude(counts: Indices32, cell: int, magnitude: float) -> floa
 @inner
 def _log_detections(
     index: IndexArrays,
-    seen: Table,
+    detections: Table,
     rotation: Array,
     stars: Indices,
     numbers: Array,
@@ -217,10 +217,10 @@ def _log_detections(
         star = stars[i]
         if star >= 0:
             magnitude = star_table[star, STAR_MAGNITUDE]
-            r0, r1, _, _, _ = residual(star_table, seen, rotation, i, star)
-            su, sv = deviation_of_one * seen[i, SIGMA_U], deviation_of_one * seen[i, SIGMA_V]
+            r0, r1, _, _, _ = residual(star_table, detections, rotation, i, star)
+            su, sv = deviation_of_one * detections[i, SIGMA_U], deviation_of_one * detections[i, SIGMA_V]
             here = math.exp(-0.5 * ((r0 / su) ** 2 + (r1 / sv) ** 2)) / (2.0 * math.pi * su * sv)
-            deviation = (magnitude - seen[i, MAGNITUDE] - numbers[ZERO_POINT]) / scatter
+            deviation = (magnitude - detections[i, MAGNITUDE] - numbers[ZERO_POINT]) / scatter
             brightness = math.exp(-0.5 * deviation * deviation) / (math.sqrt(2.0 * math.pi) * scatter)
             density = _stars_per_magnitude(counts, cell, magnitude)
             gain = field_px * min(brightness / density, 1.0) * here
@@ -244,7 +244,7 @@ def _log_detections(
 
 
 @inner
-def _noise(numbers: Array, freedom: int, known: bool) -> tuple[float, float]:
+def _noise(numbers: Array, freedom: int, has_known_errors: bool) -> tuple[float, float]:
     """Variance of unit weight for the bound, and the log of the factor for averaging over it.
 
     If the caller gave errors, the prior of the variance is the scaled inverse χ² with `PRIOR_FREEDOM` degrees
@@ -252,7 +252,7 @@ def _noise(numbers: Array, freedom: int, known: bool) -> tuple[float, float]:
     average is by Laplace's method, or by a bound on the integral if the estimate lies below the range.
     """
     variance = numbers[VARIANCE]
-    if known:
+    if has_known_errors:
         variance = (PRIOR_FREEDOM + variance * freedom) / (PRIOR_FREEDOM + freedom)
         density = -0.5 * PRIOR_FREEDOM * (math.log(variance) + 1.0 / variance - 1.0)
         return variance, density + 0.5 * math.log(PRIOR_FREEDOM / (PRIOR_FREEDOM + freedom))
@@ -265,7 +265,7 @@ def _noise(numbers: Array, freedom: int, known: bool) -> tuple[float, float]:
 @inner
 def log_false_probability(
     index: IndexArrays,
-    seen: Table,
+    detections: Table,
     rotation: Array,
     stars: Indices,
     matched: int,
@@ -278,7 +278,7 @@ def log_false_probability(
 
     Parameters
     ----------
-    seen : Table
+    detections : Table
         Detections for the refined attitude (rescaled if the focal length was free).
     rotation, stars, matched, normal, numbers
         From `starid.identification.geometric.refinement.refine`.
@@ -296,7 +296,7 @@ def log_false_probability(
         return 0.0
     variance, noise_factor = _noise(numbers, freedom, settings.sigmas_known != 0)
     log_factor, lone = _log_detections(
-        index, seen, rotation, stars, numbers, math.sqrt(variance), settings.field_px
+        index, detections, rotation, stars, numbers, math.sqrt(variance), settings.field_px
     )
     log_factor += noise_factor
     half_volume = 1.5 * math.log(2.0 * math.pi * variance) - 0.5 * math.log(determinant)

@@ -31,6 +31,7 @@ BINS_PER_FEATURE: Final = 32
 _CELLS_PER_BUCKET: Final = 4
 _SCAN: Final = 24
 _STACK: Final = 64
+_LEAST_ROOM: Final = 8
 _HALF_STEP: Final = 0.5 + 1e-9
 
 
@@ -191,21 +192,23 @@ def _push_children(
 
 
 @inner_checked
-def _sift_down(distances: Array, cells: Indices, size: int) -> None:
-    """Restore the heap (largest distance, then largest cell, on top) after its top was replaced."""
-    at = 0
-    while True:
-        child = 2 * at + 1
-        if child >= size:
-            return
-        other = child + 1
-        if other < size and (distances[other], cells[other]) > (distances[child], cells[child]):
-            child = other
-        if (distances[child], cells[child]) <= (distances[at], cells[at]):
-            return
-        distances[at], distances[child] = distances[child], distances[at]
-        cells[at], cells[child] = cells[child], cells[at]
-        at = child
+def _keep_nearest(distances: Array, cells: Indices, count: int, size: int) -> int:
+    """Move the nearest `size` of the first `count` to the front, in no particular order; return how many there are."""
+    if count <= size:
+        return count
+    limit = np.partition(distances[:count], size - 1)[size - 1]
+    nearer = 0
+    for i in range(count):
+        nearer += distances[i] < limit
+    tied = np.sort(cells[:count][distances[:count] == limit])
+    last = tied[size - nearer - 1]
+    kept = 0
+    for i in range(count):
+        if distances[i] < limit or (distances[i] == limit and cells[i] <= last):
+            distances[kept] = distances[i]
+            cells[kept] = cells[i]
+            kept += 1
+    return kept
 
 
 @compiled
@@ -224,14 +227,16 @@ def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: I
         Output (k,): squared distance in code steps, and cell.
     """
     size = cells.size
-    for i in range(size):
-        distances[i] = math.inf
-        cells[i] = -1
+    room = size + max(size, _LEAST_ROOM)
+    near = np.empty(room)
+    near_cells = np.empty(room, dtype=np.int64)
+    count = 0
+    limit = math.inf
     stack = np.zeros((_STACK, 3))
     top = 1
     while top > 0:
         top -= 1
-        if stack[top, 2] > distances[0]:
+        if stack[top, 2] > limit:
             continue
         level = int(stack[top, 0])
         prefix = int(stack[top, 1])
@@ -239,17 +244,25 @@ def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: I
         first = index.start[prefix << rest]
         last = index.start[(prefix + 1) << rest]
         if rest > 0 and last - first > _SCAN:
-            top = _push_children(index, level, prefix, query, 0.0, distances[0], stack, top)
+            top = _push_children(index, level, prefix, query, 0.0, limit, stack, top)
             continue
         for i in range(first, last):
             d = 0.0
             for f in range(5):
                 gap = index.codes[i, f] - query[f]
                 d += gap * gap
-            if d < distances[0] or (d == distances[0] and index.cells[i] < cells[0]):
-                distances[0] = d
-                cells[0] = index.cells[i]
-                _sift_down(distances, cells, size)
+            if d > limit:
+                continue
+            near[count] = d
+            near_cells[count] = index.cells[i]
+            count += 1
+            if count == room:
+                count = _keep_nearest(near, near_cells, count, size)
+                limit = near[:count].max()
+    count = _keep_nearest(near, near_cells, count, size)
+    for i in range(size):
+        distances[i] = near[i] if i < count else math.inf
+        cells[i] = near_cells[i] if i < count else -1
 
 
 @compiled

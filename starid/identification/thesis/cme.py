@@ -64,11 +64,11 @@ class CameraMotion:
 
 
 @inner_checked
-def _mean_positions(before: Array, now: Array, chosen: Mask, centre: Array) -> int:
+def _mean_positions(before: Array, now: Array, sample: Mask, centre: Array) -> int:
     """Fill in the mean positions (x, y before; x, y now) of the chosen stars; return their number."""
     count = 0
-    for i in range(chosen.size):
-        if chosen[i]:
+    for i in range(sample.size):
+        if sample[i]:
             count += 1
             centre[0] += before[i, 0]
             centre[1] += before[i, 1]
@@ -80,15 +80,15 @@ def _mean_positions(before: Array, now: Array, chosen: Mask, centre: Array) -> i
 
 
 @compiled
-def rigid_fit(before: Array, now: Array, chosen: Mask, motion: Array) -> bool:
+def rigid_fit(before: Array, now: Array, sample: Mask, motion: Array) -> bool:
     """Fit a rigid motion (cos, sin, x, y) to the chosen stars; False if there are fewer than two."""
     centre = np.zeros(4)
-    if _mean_positions(before, now, chosen, centre) < 2:
+    if _mean_positions(before, now, sample, centre) < 2:
         return False
     along = 0.0
     across = 0.0
-    for i in range(chosen.size):
-        if chosen[i]:
+    for i in range(sample.size):
+        if sample[i]:
             x = before[i, 0] - centre[0]
             y = before[i, 1] - centre[1]
             u = now[i, 0] - centre[2]
@@ -107,14 +107,14 @@ def rigid_fit(before: Array, now: Array, chosen: Mask, motion: Array) -> bool:
 
 
 @inner_checked
-def affine_fit(before: Array, now: Array, chosen: Mask, matrix: Array) -> bool:
+def affine_fit(before: Array, now: Array, sample: Mask, matrix: Array) -> bool:
     """Fit an affine transformation, `matrix` (2, 3), to the chosen stars; False if too few or collinear."""
     centre = np.zeros(4)
-    if _mean_positions(before, now, chosen, centre) < _AFFINE_SAMPLE:
+    if _mean_positions(before, now, sample, centre) < _AFFINE_SAMPLE:
         return False
     xx = xy = yy = xu = yu = xv = yv = 0.0
-    for i in range(chosen.size):
-        if chosen[i]:
+    for i in range(sample.size):
+        if sample[i]:
             x = before[i, 0] - centre[0]
             y = before[i, 1] - centre[1]
             u = now[i, 0] - centre[2]
@@ -139,12 +139,12 @@ def affine_fit(before: Array, now: Array, chosen: Mask, matrix: Array) -> bool:
 
 
 @inner_checked
-def fit(before: Array, now: Array, chosen: Mask, affine: bool, matrix: Array) -> bool:
+def fit(before: Array, now: Array, sample: Mask, affine: bool, matrix: Array) -> bool:
     """Fit a rigid or affine transformation, `matrix` (2, 3), to the chosen stars; False if too few."""
     if affine:
-        return affine_fit(before, now, chosen, matrix)
+        return affine_fit(before, now, sample, matrix)
     motion = np.empty(4)
-    if not rigid_fit(before, now, chosen, motion):
+    if not rigid_fit(before, now, sample, motion):
         return False
     matrix[0, 0] = motion[0]
     matrix[0, 1] = -motion[1]
@@ -186,25 +186,25 @@ def _negative_log_likelihood(distances: Array, sigma: float) -> float:
 
 
 @inner_checked
-def _draw(stars: int, affine: bool, every: bool, trial: int, state: int, chosen: Mask) -> int:
+def _draw(stars: int, affine: bool, every: bool, trial: int, state: int, sample: Mask) -> int:
     """Choose the stars of a hypothesis, in order or at random; return the state of the generator."""
-    chosen[:] = False
+    sample[:] = False
     if every:
         first = 0
         left = trial
         while left >= stars - 1 - first:
             left -= stars - 1 - first
             first += 1
-        chosen[first] = True
-        chosen[first + 1 + left] = True
+        sample[first] = True
+        sample[first + 1 + left] = True
         return state
     wanted = _AFFINE_SAMPLE if affine else 2
     count = 0
     while count < wanted:
         state = (state * 1103515245 + 12345) & 0x7FFFFFFF
         pick = (state >> 8) % stars
-        if not chosen[pick]:
-            chosen[pick] = True
+        if not sample[pick]:
+            sample[pick] = True
             count += 1
     return state
 
@@ -244,13 +244,13 @@ def mlesac(
     every = not affine and pairs <= trials
     state = seed & 0x7FFFFFFF
     trial = np.empty((2, 3))
-    chosen = np.zeros(m, dtype=np.bool_)
+    sample = np.zeros(m, dtype=np.bool_)
     distances = np.empty(m)
     sigma = max(threshold / 3.0, LIKELY_FLOOR_DEG)
     best = math.inf
     for number in range(pairs if every else trials):
-        state = _draw(m, affine, every, number, state, chosen)
-        if not fit(before, now, chosen, affine, trial):
+        state = _draw(m, affine, every, number, state, sample)
+        if not fit(before, now, sample, affine, trial):
             continue
         transform_distances(before, now, trial, distances)
         cost = _negative_log_likelihood(distances, sigma)

@@ -90,10 +90,10 @@ def pair_stars(
     `pairs` (n, 2) receives the observed star and the index in `near`.
     """
     c, s, x, y = math.cos(turn), math.sin(turn), 0.0, 0.0
-    found = 0
+    pair_count = 0
     tolerance = tolerance_px
     for _ in range(_REFITS):
-        found = 0
+        pair_count = 0
         sums = np.zeros(4)
         along = 0.0
         across = 0.0
@@ -110,17 +110,17 @@ def pair_stars(
                     best = square
                     partner = j
             if partner >= 0:
-                pairs[found, 0] = i
-                pairs[found, 1] = partner
+                pairs[pair_count, 0] = i
+                pairs[pair_count, 1] = partner
                 sums[0] += near[partner, 0]
                 sums[1] += near[partner, 1]
                 sums[2] += observed[i, 0]
                 sums[3] += observed[i, 1]
-                found += 1
-        if found < 3:
-            return found
-        sums /= found
-        for k in range(found):
+                pair_count += 1
+        if pair_count < 3:
+            return pair_count
+        sums /= pair_count
+        for k in range(pair_count):
             u = near[pairs[k, 1], 0] - sums[0]
             v = near[pairs[k, 1], 1] - sums[1]
             p = observed[pairs[k, 0], 0] - sums[2]
@@ -134,7 +134,7 @@ def pair_stars(
         x = sums[2] - c * sums[0] + s * sums[1]
         y = sums[3] - s * sums[0] - c * sums[1]
         tolerance = max(0.55 * tolerance, 0.15 * tolerance_px)
-    return found
+    return pair_count
 
 
 @compiled
@@ -179,9 +179,9 @@ def next_candidate(
         turn, best = vote_roll(observed, polar, near, count, offset, gate, votes)
         if best < need:
             continue
-        found = pair_stars(observed, near, count, turn, 2.5 * offset, gate, matched)
-        if found >= need:
-            for k in range(found):
+        pair_count = pair_stars(observed, near, count, turn, 2.5 * offset, gate, matched)
+        if pair_count >= need:
+            for k in range(pair_count):
                 matched[k, 1] = rows[matched[k, 1]]
-            return place, found
+            return place, pair_count
     return -1, 0

@@ -117,8 +117,8 @@ class FeatureErrors:
                 else search.answer_in_region(later, answer.attitude.rotated(move), side_deg)
             )
             if local is not None:
-                found = elsewhere if math.hypot(*errors[-1][:2]) > math.radians(RIGHT_DEG) else here
-                found.append(local.error_psi)
+                errors_psi = elsewhere if math.hypot(*errors[-1][:2]) > math.radians(RIGHT_DEG) else here
+                errors_psi.append(local.error_psi)
         squares = np.array(errors) ** 2
         upper = np.quantile(psi, np.arange(1, _CLASSES + 1) / _CLASSES)
         upper[-1] = math.inf
@@ -128,9 +128,9 @@ class FeatureErrors:
         count = np.bincount(rows, minlength=_CLASSES)
         wrong = (np.bincount(rows[lost], minlength=_CLASSES) + 0.5) / (count + 1.0)
         likely, unlikely = (
-            (np.bincount(np.searchsorted(upper, found), minlength=_CLASSES) + 0.5)
-            / (len(found) + 0.5 * _CLASSES)
-            for found in (here, elsewhere)
+            (np.bincount(np.searchsorted(upper, errors_psi), minlength=_CLASSES) + 0.5)
+            / (len(errors_psi) + 0.5 * _CLASSES)
+            for errors_psi in (here, elsewhere)
         )
         return cls(upper, wrong, right, _mean_squares(squares[lost]), unlikely / likely)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -22,6 +23,7 @@ from starid.identification.thesis.database import FeatureDatabase
 from starid.identification.thesis.features import FeatureVector, extract_features
 from starid.identification.thesis.frame_sky import UX, UZ, FrameSky
 from starid.identification.thesis.lsi import LostInSpace, LsiEstimate, LsiSolution
+from starid.identification.thesis.search_spots import Spots, places_not_tried
 
 MIN_STARS: Final = 3
 """Fewest stars of a field that has features."""
@@ -43,8 +45,6 @@ ESTIMATE_SHARE: Final = 0.02
 """The same for a boresight that the LASSO has interpolated."""
 _SPREAD: Final = 0.8
 """Side of the spots, each of which is tried once, as a share of the error of a neighbour's boresight."""
-_SPOTS_PER_BAND: Final = 100_000.0
-"""Numbers reserved for the spots of one band of declination, more than there are."""
 _STAGES: Final = (30, 300)
 """Numbers of nearest cells tried before all are."""
 
@@ -197,33 +197,22 @@ class FeatureSearch:
         self, field: FieldStars, observations: Sequence[FeatureVector]
     ) -> Iterator[tuple[Attitude | None, int]]:
         """The same as `attitudes`, from growing numbers of cells nearest to each of several feature vectors."""
-        tried = np.empty(0)
+        spots, grid = self._spots, self.database.grid.arrays
+        tried = spots.none_tried()
         most = min(self.neighbours, self.database.cells)
         normalised = [self.database.normalise(features) for features in observations]
         for count in sorted({min(stage, most) for stage in (*_STAGES, most)}):
+            places = np.empty((count, 2))
             for observation in normalised:
                 distances, cells = self.lost_in_space.neighbours(observation, count)
-                order = np.lexsort((cells, distances))
-                centres = self.cell_centres(cells[order][cells[order] >= 0])
-                spots = self._spots(centres)
-                first = np.sort(np.unique(spots, return_index=True)[1])
-                new = first[~np.isin(spots[first], tried)]
-                tried = np.concatenate([tried, spots[new]])
-                yield from self.attitudes(field, centres[new], CELL_SHARE)
+                new = places_not_tried(grid, spots, distances, cells, tried, places)
+                yield from self.attitudes(field, places[:new], CELL_SHARE)
 
-    def _spots(self, places: Array) -> Array:
-        """Number the cells, of a grid just fine enough for the votes, that contain positions (n, 2)."""
-        step = math.degrees(_SPREAD * CELL_SHARE * self._half_width_px / self.database.parameters.focal_px)
-        band = np.floor((places[:, 1] + 90.0) / step)
-        columns = np.maximum(np.rint(360.0 * np.cos(np.radians((band + 0.5) * step - 90.0)) / step), 1.0)
-        return np.asarray(band * _SPOTS_PER_BAND + np.floor(places[:, 0] / 360.0 * columns), dtype=np.float64)
-
-    def cell_centres(self, cells: Indices) -> Array:
-        """Right ascension and declination of cells, degrees, (n, 2)."""
-        grid = self.database.grid
-        row = np.searchsorted(grid.row_start, cells, side="right") - 1
-        ra = grid.first_ra_deg + (cells - grid.row_start[row]) * grid.row_ra_step_deg[row]
-        return np.column_stack([ra % 360.0, grid.row_dec_deg[row]])
+    @cached_property
+    def _spots(self) -> Spots:
+        return Spots.of_side(
+            math.degrees(_SPREAD * CELL_SHARE * self._half_width_px / self.database.parameters.focal_px)
+        )
 
     def attitudes(
         self, field: FieldStars, candidates: Array, share: float

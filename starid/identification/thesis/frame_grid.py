@@ -41,11 +41,15 @@ class GridArrays(NamedTuple):
     row_ra_step: Array
     first_ra: float
 
-    def rows(self, chosen: slice) -> GridArrays:
+    def rows(self, selection: slice) -> GridArrays:
         """Select some of the rows; the cell numbers do not change."""
-        start = self.row_start[chosen.start : chosen.stop + 1]
+        start = self.row_start[selection.start : selection.stop + 1]
         return GridArrays(
-            start, self.row_columns[chosen], self.row_dec[chosen], self.row_ra_step[chosen], self.first_ra
+            start,
+            self.row_columns[selection],
+            self.row_dec[selection],
+            self.row_ra_step[selection],
+            self.first_ra,
         )
 
 

@@ -131,7 +131,7 @@ def _pair_hypotheses(
     order1 = np.argsort(-first[0][: counts[0]])
     order2 = np.argsort(second[0][: counts[1]])
     lengths = second[0][order2]
-    found = 0
+    count = 0
     for k in order1:
         at = np.searchsorted(lengths, first[0][k] - tolerance)
         while at < counts[1] and lengths[at] <= first[0][k] + tolerance:
@@ -146,12 +146,12 @@ def _pair_hypotheses(
                 gap = brightness_before[first[2][k, end]] - brightness_now[second[2][j, end]]
                 alike = alike and abs(gap) <= faint
             if alike:
-                couples[found, 0] = k
-                couples[found, 1] = j
-                found += 1
-                if found == couples.shape[0]:
-                    return found
-    return found
+                couples[count, 0] = k
+                couples[count, 1] = j
+                count += 1
+                if count == couples.shape[0]:
+                    return count
+    return count
 
 
 @compiled
@@ -191,13 +191,13 @@ def find_motion(
         _pairs(now, brightness_now, least, second[0], second[1], second[2]),
     )
     couples = np.empty((_MAX_COUPLES, 2), dtype=np.int64)
-    found = _pair_hypotheses(
+    couple_count = _pair_hypotheses(
         first, second, counts, brightness_before, brightness_now, _GATE * sigma, faint, max_rotation, couples
     )
     trial = np.empty(4)
-    stride = max(found / _MAX_HYPOTHESES, 1.0)
+    stride = max(couple_count / _MAX_HYPOTHESES, 1.0)
     enough = _ENOUGH * min(before.shape[0], now.shape[0])
-    for h in range(min(found, _MAX_HYPOTHESES)):
+    for h in range(min(couple_count, _MAX_HYPOTHESES)):
         couple = couples[int(h * stride)]
         a, b = first[2][couple[0], 0], first[2][couple[0], 1]
         c, d = second[2][couple[1], 0], second[2][couple[1], 1]

@@ -106,7 +106,7 @@ def _bin_points(points: Array, side: float, order: Indices, shape: Indices) -> t
 
 @inner_checked
 def _neighbours(
-    points: Array, bins: tuple[Indices, Indices, Indices], here: int, epsilon: float, found: Indices
+    points: Array, bins: tuple[Indices, Indices, Indices], here: int, epsilon: float, neighbours: Indices
 ) -> int:
     """List all points within ε of a point, including itself; return their number.
 
@@ -124,7 +124,7 @@ def _neighbours(
         for k in range(begin, end):
             square = (points[k, 0] - a) ** 2 + (points[k, 1] - b) ** 2 + (points[k, 2] - c) ** 2
             if square <= limit:
-                found[count] = k
+                neighbours[count] = k
                 count += 1
     return count
 
@@ -153,10 +153,10 @@ def density_clusters(points: Array, epsilon: float, min_samples: float) -> Indic
     ordered = points[order]
     place = np.empty(n, dtype=np.int64)
     place[order] = np.arange(n)
-    found = np.empty(n, dtype=np.int64)
+    neighbours = np.empty(n, dtype=np.int64)
     core = np.zeros(n, dtype=np.bool_)
     for k in range(n):
-        core[k] = _neighbours(ordered, bins, k, epsilon, found) >= min_samples
+        core[k] = _neighbours(ordered, bins, k, epsilon, neighbours) >= min_samples
     stack = np.empty(n, dtype=np.int64)
     label = 0
     for i in range(n):
@@ -168,9 +168,9 @@ def density_clusters(points: Array, epsilon: float, min_samples: float) -> Indic
         top = 1
         while top > 0:
             top -= 1
-            count = _neighbours(ordered, bins, stack[top], epsilon, found)
+            count = _neighbours(ordered, bins, stack[top], epsilon, neighbours)
             for k in range(count):
-                j = found[k]
+                j = neighbours[k]
                 if labels[j] == -1:
                     labels[j] = label
                     if core[j]:

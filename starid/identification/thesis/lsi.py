@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices
+from starid.identification.options import Solver
 from starid.identification.thesis.cell_search import (
     CellArrays,
     CellIndex,
@@ -29,7 +30,6 @@ from starid.identification.thesis.reference import ReferenceSearch, reference_pa
 from starid.kernels.jit import compiled, inner_checked
 
 Precision = Literal["exact", "stored"]
-Solver = Literal["exact", "matlab", "sklearn"]
 
 _WHOLE_SKY_DEG: Final = 720.0
 _CODES_PER_RADIAN: Final = 255.0 / (2.0 * math.pi)

@@ -31,6 +31,7 @@ from starid.errors import StaridError
 from starid.identification.geometric.identifier import Identifier
 from starid.identification.geometric.pattern_index import resolved_stars
 from starid.identification.geometric.verified import VerifiedIdentifier
+from starid.identification.options import REGION_DEG, LsiOptions
 from starid.identification.single_camera import CheckedDetections
 from starid.identification.solution import FeatureReport, Reason, Solution
 from starid.identification.thesis.database import DatabaseParameters, sky_of
@@ -43,14 +44,11 @@ from starid.identification.thesis.feature_search import (
     FeatureSearch,
     FieldStars,
 )
-from starid.identification.thesis.lsi import LostInSpace, Solver
+from starid.identification.thesis.lsi import LostInSpace
 
 STARS_PER_FIELD: Final = 10
 """Number of stars per field for the default brightness limit of the features: fewer make fields alike, and with more
 some are always on the wrong side of the limit."""
-
-REGION_DEG: Final = 2.0
-"""Least side of a region of search, degrees."""
 
 STARS_PER_MATCH: Final = 60
 """Number of stars per field that are paired with detections."""
@@ -61,9 +59,6 @@ WINDOW_PX: Final = 12.0
 SOLAR_COLOUR_B_V: Final = 0.65
 """B−V of a star for which the colour term is zero; also taken for stars of unknown colour."""
 
-_TAU_REFINED: Final = 1.0
-_TAU_ALONE: Final = 0.5
-_DEFAULT_SIGMA_MAG: Final = 0.1
 _DEEPER_MAG: Final = 0.5
 _ZERO_POINT_STEPS: Final = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5)
 _ZERO_POINT_STAR: Final = 25
@@ -92,91 +87,6 @@ class LsiReport:
     tried: int
     verified: int
     zero_point: float
-
-
-@dataclass(frozen=True)
-class LsiOptions:
-    """Settings of an LSI identifier.
-
-    Attributes
-    ----------
-    refinement
-        Refine and verify the attitude with matched stars. Otherwise it is that of the features alone, to about a degree
-        and with the uncertainty of simulated fields (`starid.identification.thesis.feature_error`).
-    tau
-        Threshold τ on ε_ψ, beyond which the answer from a region of search is not good enough. By default the two of
-        the thesis: 1 with refinement, which verifies what it lets pass, and 0.5 without.
-    invalid_factor
-        Factor K: features with ε_ψ > K·τ give no attitude.
-    feature_limit
-        Brightness limit κ: faintest magnitude of the stars in the features; default: for ten stars per field, but
-        not fainter than `detected_limit`.
-    detected_limit
-        Magnitude at which the sensor finds 90 % of the stars; a device measures it on its own images. By default all
-        stars within the brightness limit are found.
-    magnitude_sigma
-        One-sigma error of a magnitude at that limit; a device measures it too.
-    colour_term
-        The sensor's magnitude is V − colour_term·(B−V − 0.65).
-    overlap
-        Overlap ratio of the database.
-    neighbours
-        Largest number of neighbours tried by the refinement for each feature vector, nearest first.
-    zero_point
-        Magnitude of unit flux, if it is known. Otherwise it is learned: each answer determines it, and for
-        the next frame that value is tried first, and then guesses from the frame.
-    limiting_magnitude
-        Faintest V of the verification (see `Identifier`).
-    database
-        Feature database to use instead of the cached one.
-    cache
-        Keep the database and the index in the cache folder.
-    divided
-        If the whole field has no answer, search nine circles of half its width (section 7.2 of the thesis): for a field
-        that a body covers in part. Needs a second database, and the refinement.
-    solver
-        Solver of nearest neighbour and LASSO: "exact", "matlab" or "sklearn" (see `LostInSpace`).
-    """
-
-    refinement: bool = True
-    tau: float | None = None
-    invalid_factor: float = 10.0
-    feature_limit: float | None = None
-    detected_limit: float | None = None
-    magnitude_sigma: float = _DEFAULT_SIGMA_MAG
-    colour_term: float = 0.0
-    overlap: float = 0.99
-    neighbours: int = 10_000
-    zero_point: float | None = None
-    limiting_magnitude: float | None = None
-    database: str | Path | None = None
-    cache: bool = True
-    divided: bool = False
-    solver: Solver = "exact"
-
-    def __post_init__(self) -> None:
-        if self.neighbours < 1:
-            raise StaridError(f"lsi neighbours: must be at least 1, not {self.neighbours}")
-        if not (self.threshold > 0.0 and self.invalid_factor > 0.0):
-            raise StaridError(
-                f"lsi tau, invalid_factor: must be positive, not {self.tau}, {self.invalid_factor}"
-            )
-        if self.divided and not self.refinement:
-            raise StaridError(
-                "lsi divided: needs refinement = true, because only matched stars tell which circle is right"
-            )
-
-    @property
-    def threshold(self) -> float:
-        """The threshold τ on ε_ψ, as given or the default."""
-        if self.tau is not None:
-            return self.tau
-        return _TAU_REFINED if self.refinement else _TAU_ALONE
-
-    @property
-    def largest_error_psi(self) -> float:
-        """The largest ε_ψ of features that give an attitude, K·τ."""
-        return self.invalid_factor * self.threshold
 
 
 class LsiIdentifier(VerifiedIdentifier):

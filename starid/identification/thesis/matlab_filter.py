@@ -46,14 +46,14 @@ def trials_needed(inliers: int, matches: int) -> int:
 
 
 @inner_checked
-def _draw_three(order: Indices, chosen: Mask, state: int) -> int:
+def _draw_three(order: Indices, sample: Mask, state: int) -> int:
     """Choose three matches at random; return the state of the generator."""
-    chosen[:] = False
+    sample[:] = False
     for k in range(_SAMPLE):
         state = (state * 1103515245 + 12345) & 0x7FFFFFFF
         j = k + (state >> 8) % (order.size - k)
         order[k], order[j] = order[j], order[k]
-        chosen[order[k]] = True
+        sample[order[k]] = True
     return state
 
 
@@ -80,13 +80,13 @@ def affine_inliers(before: Array, now: Array, largest: float, seed: int, inliers
     if m < _SAMPLE:
         return False
     order = np.arange(m)
-    chosen = np.zeros(m, dtype=np.bool_)
+    sample = np.zeros(m, dtype=np.bool_)
     matrix = np.empty((2, 3))
     distances = np.empty(m)
     best, trials, done, skipped = math.inf, MAX_TRIALS, 0, 0
     while done < trials and skipped < _LARGEST_SKIP:
-        seed = _draw_three(order, chosen, seed)
-        if not affine_fit(before, now, chosen, matrix):
+        seed = _draw_three(order, sample, seed)
+        if not affine_fit(before, now, sample, matrix):
             skipped += 1
             continue
         done += 1

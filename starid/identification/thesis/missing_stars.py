@@ -123,7 +123,7 @@ class DividedField:
 
     def answers(self, frame: ObservedFrame) -> list[SubfieldAnswer]:
         """Estimates from all circles that contain a star."""
-        found = []
+        estimates = []
         for centre in self.centres():
             places = frame.positions - centre
             inside = np.sum(places**2, axis=1) <= self._radius**2
@@ -134,7 +134,7 @@ class DividedField:
             roll = math.remainder(features.theta_rad - estimate.theta_rad, 2.0 * math.pi)
             c, s = math.cos(roll), math.sin(roll)
             east, north = c * centre[0] + s * centre[1], c * centre[1] - s * centre[0]
-            found.append(
+            estimates.append(
                 SubfieldAnswer(
                     float(estimate.right_ascension_deg - east) % 360.0,
                     float(estimate.declination_deg - north),
@@ -143,7 +143,7 @@ class DividedField:
                     1,
                 )
             )
-        return found
+        return estimates
 
     def solve(self, frame: ObservedFrame) -> SubfieldAnswer | None:
         """Return the median boresight on which most circles agree; None if no two agree."""

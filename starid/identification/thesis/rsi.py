@@ -266,11 +266,11 @@ class RecursiveIdentification:
     ) -> tuple[LsiSolution, float, float]:
         start = time.perf_counter()
         cell, distance = self._lsi.nearest(observation, theta_rad=angle)
-        found = time.perf_counter()
+        searched = time.perf_counter()
         other = self._lsi.estimate(observation, cell, distance)
         solved = time.perf_counter()
         better = other if other.mse.error_psi < solution.mse.error_psi else solution
-        return better, found - start, solved - found
+        return better, searched - start, solved - searched
 
     def _filtered(self, frame: ObservedFrame) -> tuple[Mask, CameraMotion | None]:
         """Return which objects are stars (all without a previous frame), and their motion or None."""

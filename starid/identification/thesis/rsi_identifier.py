@@ -20,16 +20,15 @@ from starid.attitude import Attitude
 from starid.attitude.wahba import solve_wahba
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
+from starid.identification.options import RsiOptions
 from starid.identification.single_camera import CheckedDetections, SingleCameraIdentifier
 from starid.identification.solution import FeatureReport, Solution
 from starid.identification.thesis.cme import matched_motion
 from starid.identification.thesis.false_stars import ObservedFrame
 from starid.identification.thesis.feature_search import ESTIMATE_SHARE, FeatureAnswer, FieldStars
 from starid.identification.thesis.lsi_identifier import (
-    REGION_DEG,
     WINDOW_PX,
     LsiIdentifier,
-    LsiOptions,
     report_of,
 )
 from starid.identification.thesis.rsi import RsiSettings, region_side
@@ -66,28 +65,6 @@ class RsiStatistics:
     region_sum_deg: float = 0.0
 
 
-@dataclass(frozen=True)
-class RsiOptions(LsiOptions):
-    """Settings of an RSI identifier, in addition to those of an LSI identifier.
-
-    Attributes
-    ----------
-    gamma_min_deg
-        Smallest side of the search region, degrees.
-    gamma_scale
-        Factor by which the side grows with the errors of the motion.
-    filter_false_stars
-        Follow the detections from frame to frame, and use only true stars for the features.
-    position_sigma_px
-        One-sigma error of a position per axis, pixels, as assumed by the filter.
-    """
-
-    gamma_min_deg: float = REGION_DEG
-    gamma_scale: float = 1.0
-    filter_false_stars: bool = True
-    position_sigma_px: float = 0.5
-
-
 @dataclass(frozen=True, eq=False)
 class Preprocessed:
     """What filter and motion estimation say about an image.
@@ -96,29 +73,32 @@ class Preprocessed:
     ----------
     true_stars
         Which detections are stars, by previous images, (n,); all if nothing is known.
-    removed
-        Number of detections that are not.
     rotation
         Rotation of the sky from the previous image to this one in the sensor frame, (3, 3); None if it is unknown.
     rotation_deg, translation_deg
-        The same as rotation γ̃ about the boresight and length of the translation ρ̃, degrees; 0 if unknown.
+        The same as rotation γ̃ about the boresight, and as translation ρ̃, the angle by which the boresight moved, degrees;
+        0 if unknown.
     side_deg
         Side of the region of search (`rsi.py`), degrees.
     """
 
     true_stars: Mask
-    removed: int
     rotation: Array | None
     rotation_deg: float
     translation_deg: float
     side_deg: float
 
+    @property
+    def removed_index(self) -> tuple[int, ...]:
+        """Rows of the detections that are not stars."""
+        return tuple(np.flatnonzero(~self.true_stars).tolist())
+
     def add_to(self, report: FeatureReport | None, **others: Any) -> FeatureReport:
         """Add filter and motion to the report of the features."""
         return dataclasses.replace(
             FeatureReport("lsi") if report is None else report,
-            stars=self.true_stars.size - self.removed,
-            removed=self.removed,
+            stars=int(np.count_nonzero(self.true_stars)),
+            removed_index=self.removed_index,
             rotation_deg=self.rotation_deg,
             translation_deg=self.translation_deg,
             **others,
@@ -209,7 +189,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         """LSI, line 12 of algorithm 3: from the true stars and, if that fails, from all detections."""
         zero_points = self.lsi.zero_points(measured.flux)
         solution = self.lsi.solve(measured, zero_points, first, known.true_stars)
-        if solution.valid or known.removed == 0:
+        if solution.valid or known.true_stars.all():
             return solution
         unfiltered = self.lsi.solve(measured, zero_points)
         return unfiltered if unfiltered.valid else solution
@@ -236,7 +216,8 @@ class RsiIdentifier(SingleCameraIdentifier):
             solution = self._whole_sky(measured, known, answers[:1])
         self._count(solution, side, triggered=triggered)
         self._remember(solution)
-        report = known.add_to(solution.features, triggered=triggered, region_deg=side)
+        place = (centre.ra_deg, centre.dec_deg)
+        report = known.add_to(solution.features, triggered=triggered, region_deg=side, region_at_deg=place)
         return dataclasses.replace(solution, features=report)
 
     def _remember(self, solution: Solution) -> None:
@@ -269,7 +250,7 @@ class RsiIdentifier(SingleCameraIdentifier):
     def _preprocess(self, xy: Array, flux: Array) -> Preprocessed:
         """FSF and CME, lines 6 to 8 of algorithm 3."""
         unknown = Preprocessed(
-            np.ones(flux.size, dtype=np.bool_), 0, None, 0.0, 0.0, self._settings.gamma_min_deg
+            np.ones(flux.size, dtype=np.bool_), None, 0.0, 0.0, self._settings.gamma_min_deg
         )
         if self._filter is None:
             return unknown
@@ -299,10 +280,9 @@ class RsiIdentifier(SingleCameraIdentifier):
         distance_deg = np.degrees(np.linalg.norm(then @ rotation.T - now, axis=1))
         return Preprocessed(
             true_stars,
-            int(np.count_nonzero(~true_stars)),
             rotation,
-            motion.rotation_deg,
-            math.hypot(*motion.translation_deg),
+            math.degrees(math.atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])),
+            math.degrees(math.atan2(math.hypot(rotation[0, 2], rotation[1, 2]), rotation[2, 2])),
             region_side(float(distance_deg.mean()), float(distance_deg.std(ddof=1)), self._settings),
         )
 

@@ -245,9 +245,9 @@ class TrackFilter:
             return None
         voters = np.lexsort((tracks.brightness, -np.minimum(tracks.seen, 2)))[:MAX_VOTERS]
         brightest = np.argsort(brightness, kind="stable")[:MAX_VOTERS]
-        known, change = self._motions.start(self._last_motion)
+        start_motion, change = self._motions.start(self._last_motion)
         score = find_motion(
-            self._motions.moved(tracks.position[voters], known),
+            self._motions.moved(tracks.position[voters], start_motion),
             tracks.brightness[voters],
             positions[brightest],
             brightness[brightest],
@@ -259,7 +259,7 @@ class TrackFilter:
         )
         if score < _MIN_SCORE:
             return None
-        return self._motions.composed(self._motions.of_plane(change), known)
+        return self._motions.composed(self._motions.of_plane(change), start_motion)
 
     def _associate(self, positions: Array, brightness: Array, motion: Array) -> tuple[Indices, Array]:
         """Match tracks and objects; return the object of each track, or −1, and the refined motion."""
@@ -280,19 +280,19 @@ class TrackFilter:
                 settings.gate**2,
                 partner,
             )
-            chosen = partner >= 0
-            if np.count_nonzero(chosen & trusted) > _MIN_OBJECTS:
-                chosen &= trusted
+            is_paired = partner >= 0
+            if np.count_nonzero(is_paired & trusted) > _MIN_OBJECTS:
+                is_paired &= trusted
             objects = positions[np.maximum(partner, 0)]
-            if turn > 0 and chosen.any():
+            if turn > 0 and is_paired.any():
                 distance = np.hypot(*(objects - predicted).T) / np.sqrt(variance)
-                near = chosen & (distance <= _TRIM * max(float(np.median(distance[chosen])), 1.0))
-                chosen = near if np.count_nonzero(near) > _MIN_OBJECTS else chosen
-            fitted = self._motions.fit(tracks.position, objects, chosen)
+                near = is_paired & (distance <= _TRIM * max(float(np.median(distance[is_paired])), 1.0))
+                is_paired = near if np.count_nonzero(near) > _MIN_OBJECTS else is_paired
+            fitted = self._motions.fit(tracks.position, objects, is_paired)
             if fitted is not None:
                 motion = fitted
-                arm = np.sum((tracks.position - tracks.position[chosen].mean(axis=0)) ** 2, axis=1)
-                share = 1.0 / np.count_nonzero(chosen) + arm / max(float(arm[chosen].sum()), 1e-12)
+                arm = np.sum((tracks.position - tracks.position[is_paired].mean(axis=0)) ** 2, axis=1)
+                share = 1.0 / np.count_nonzero(is_paired) + arm / max(float(arm[is_paired].sum()), 1e-12)
                 error = settings.position_sigma_deg**2 * np.minimum(share, 1.0)
         return partner, motion
 

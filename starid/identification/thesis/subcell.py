@@ -121,7 +121,7 @@ def newton_from(
 
 @inner_checked
 def share_seen(
-    arrays: CellArrays, positions: Array, theta: float, ra: float, dec: float, found: Array, rows: Indices
+    arrays: CellArrays, positions: Array, theta: float, ra: float, dec: float, stars: Array, rows: Indices
 ) -> float:
     """Share of observed stars with a catalogue star within 0.75 % of the half-width of the frame.
 
@@ -131,24 +131,24 @@ def share_seen(
         Observed stars (n, 2) in the unit of the frame, and the polar angle of their frame object, radians.
     ra, dec
         Assumed boresight, degrees; the roll is the difference between the polar angles.
-    found, rows
+    stars, rows
         Workspace for `stars_near`.
     """
-    count = stars_near(arrays.sky, ra % 360.0, dec, 0.0, found, rows)
+    count = stars_near(arrays.sky, ra % 360.0, dec, 0.0, stars, rows)
     sums = np.empty(8)
     vector = np.empty(5)
     turn = theta - cell_features(arrays.sky, ra % 360.0, dec, sums, vector)
     c, s = math.cos(turn), math.sin(turn)
     limit = (_NEAR * arrays.sky.frame[HALF_WIDTH]) ** 2
-    seen = 0
+    matched = 0
     for i in range(positions.shape[0]):
         x = c * positions[i, 0] + s * positions[i, 1]
         y = c * positions[i, 1] - s * positions[i, 0]
         for j in range(count):
-            if (found[j, 0] - x) ** 2 + (found[j, 1] - y) ** 2 <= limit:
-                seen += 1
+            if (stars[j, 0] - x) ** 2 + (stars[j, 1] - y) ** 2 <= limit:
+                matched += 1
                 break
-    return float(seen / positions.shape[0])
+    return float(matched / positions.shape[0])
 
 
 @compiled
@@ -172,8 +172,8 @@ def subcell_kernel(
     polar angle (radians), the length of the residual and the share of stars seen.
     """
     compares = positions.shape[0] > 0
-    found = np.empty((_MAX_STARS if compares else 0, 3))
-    rows = np.empty(found.shape[0], dtype=np.int64)
+    stars = np.empty((_MAX_STARS if compares else 0, 3))
+    rows = np.empty(stars.shape[0], dtype=np.int64)
     most = -1.0
     stored_neighbours(index, observation * 2.55, distances, cells)
     order = np.argsort(distances)
@@ -190,19 +190,19 @@ def subcell_kernel(
             continue
         ra, dec = cell_centre(arrays.grid, cell)
         narrow = math.cos(math.radians(dec)) if arrays.sky.frame[0] > 0.5 else 1.0
-        known = False
+        is_repeated = False
         for i in range(starts):
             gap = (ra - places[i, 0] + 180.0) % 360.0 - 180.0
             if math.hypot(gap * narrow, dec - places[i, 1]) < 0.4 * reach_deg:
-                known = True
+                is_repeated = True
                 break
-        if known:
+        if is_repeated:
             continue
         cost = newton_from(arrays, observation, ra, dec, reach_deg, place)
         places[starts, 0] = ra
         places[starts, 1] = dec
         starts += 1
-        seen = share_seen(arrays, positions, theta, place[0], place[1], found, rows) if compares else 0.0
+        seen = share_seen(arrays, positions, theta, place[0], place[1], stars, rows) if compares else 0.0
         if seen > most or (seen == most and cost < best):
             most = seen
             best = cost

@@ -109,18 +109,18 @@ def _paths(vectors: Array, radius: float) -> Paths:
 
 
 @compiled_ieee
-def _search(guide: Paths, seen: Paths, tolerance: float) -> Indices:
+def _search(guide: Paths, observed: Paths, tolerance: float) -> Indices:
     """Matches (m, 2) of the stars of each observed path with those of the guide paths that fit."""
     ones, others = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
-    for i in range(seen[0].shape[0]):
-        count = seen[1][i]
+    for i in range(observed[0].shape[0]):
+        count = observed[1][i]
         reach = tolerance * np.sqrt(count)
-        for j in range(np.searchsorted(guide[0], seen[0][i] - reach), guide[0].shape[0]):
-            if guide[0][j] > seen[0][i] + reach:
+        for j in range(np.searchsorted(guide[0], observed[0][i] - reach), guide[0].shape[0]):
+            if guide[0][j] > observed[0][i] + reach:
                 break
-            if guide[1][j] == count and np.abs(guide[3][j] - seen[3][i]).max() <= tolerance:
+            if guide[1][j] == count and np.abs(guide[3][j] - observed[3][i]).max() <= tolerance:
                 for k in range(count):
-                    ones.append(np.int64(seen[2][i, k]))
+                    ones.append(np.int64(observed[2][i, k]))
                     others.append(np.int64(guide[2][j, k]))
     return np.column_stack((np.array(ones), np.array(others)))
 

@@ -67,13 +67,13 @@ def correlation(image: Array, count: int, other: Array32, width: float) -> float
 
 
 @compiled_ieee
-def _correlate(start: Indices32, images: Array32, seen: Array, radius: float, buffer: float) -> Indices:
+def _correlate(start: Indices32, images: Array32, directions: Array, radius: float, buffer: float) -> Indices:
     """Find the guide star of each observed star; −1 without a clear winner."""
-    n = seen.shape[0]
+    n = directions.shape[0]
     image, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
     matched = np.full(n, -1, dtype=np.int64)
     for pivot in range(n):
-        count, aligned = aligned_neighbours(seen, pivot, radius, buffer, image, rows)
+        count, aligned = aligned_neighbours(directions, pivot, radius, buffer, image, rows)
         if aligned < 0:
             continue
         image[:count, 1] -= image[aligned, 1]

@@ -31,13 +31,13 @@ KEPT_SHARE: Final = 0.5
 
 
 @compiled_ieee
-def votes_of(table: PairTable, stars: int, seen: Array, tolerance: float) -> Indices32:
+def votes_of(table: PairTable, stars: int, directions: Array, tolerance: float) -> Indices32:
     """Votes (n, stars) that the pairs of observed stars cast for catalogue stars."""
-    n = seen.shape[0]
+    n = directions.shape[0]
     votes = np.zeros((n, stars), dtype=np.int32)
     for i in range(n):
         for j in range(i + 1, n):
-            distance = chord_between(seen, i, seen, j)
+            distance = chord_between(directions, i, directions, j)
             start, end = pair_range(table, distance - tolerance, distance + tolerance)
             for pair in range(start, end):
                 a, b = table.first[pair], table.second[pair]
@@ -49,16 +49,16 @@ def votes_of(table: PairTable, stars: int, seen: Array, tolerance: float) -> Ind
 
 
 @compiled_ieee
-def _second_vote(vectors: Array, seen: Array, matched: Indices, tolerance: float) -> Indices:
+def _second_vote(vectors: Array, directions: Array, matched: Indices, tolerance: float) -> Indices:
     """Count, for each match, the other matches that agree with it in distance."""
-    n = seen.shape[0]
+    n = directions.shape[0]
     votes = np.zeros(n, dtype=np.int64)
     for i in range(n):
         for j in range(i + 1, n):
             if matched[i] < 0 or matched[j] < 0 or matched[i] == matched[j]:
                 continue
             distance = chord_between(vectors, matched[i], vectors, matched[j])
-            if abs(distance - chord_between(seen, i, seen, j)) <= tolerance:
+            if abs(distance - chord_between(directions, i, directions, j)) <= tolerance:
                 votes[i] += 1
                 votes[j] += 1
     return votes

@@ -84,15 +84,15 @@ def lookup_table(vectors: Array, magnitude: Array, radius: float, buffer: float)
     Each pattern is aligned with its nearest star beyond the buffer in the brighter half (`bright_neighbour`).
     """
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
-    found = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+    occupied = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     cells, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
     for star in range(vectors.shape[0]):
         count = neighbours_of(vectors, star, radius, polar, rows)
         aligned = bright_neighbour(polar, rows, count, magnitude, buffer, 0)
         if aligned < 0:
             continue
-        for k in range(occupied_cells(polar, count, aligned, radius, GRID, found)):
-            cells.append(found[k])
+        for k in range(occupied_cells(polar, count, aligned, radius, GRID, occupied)):
+            cells.append(occupied[k])
             stars.append(np.int64(star))
     keys, owners = np.array(cells), np.array(stars)
     start, order = grouped(keys, GRID * GRID)
@@ -101,30 +101,30 @@ def lookup_table(vectors: Array, magnitude: Array, radius: float, buffer: float)
 
 @inner
 def count_votes(
-    table: Table, polar: Array, count: int, aligned: int, radius: float, found: Indices, votes: Indices32
+    table: Table, polar: Array, count: int, aligned: int, radius: float, occupied: Indices, votes: Indices32
 ) -> int:
     """Vote for the stars whose patterns share cells with the observed one; return its number of cells."""
     start, owner = table
-    cells = occupied_cells(polar, count, aligned, radius, GRID, found)
+    cells = occupied_cells(polar, count, aligned, radius, GRID, occupied)
     for k in range(cells):
-        for place in range(start[found[k]], start[found[k] + 1]):
+        for place in range(start[occupied[k]], start[occupied[k] + 1]):
             votes[owner[place]] += 1
     return cells
 
 
 @compiled_ieee
-def _vote(table: Table, stars: int, seen: Array, radius: float, buffer: float) -> Indices:
+def _vote(table: Table, stars: int, directions: Array, radius: float, buffer: float) -> Indices:
     """Match (m, 2) each observed star, as the pivot, with the guide stars that have the most votes."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
-    found = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
-    matches = np.empty((seen.shape[0] * MAX_TIED, 2), dtype=np.int64)
+    occupied = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+    matches = np.empty((directions.shape[0] * MAX_TIED, 2), dtype=np.int64)
     filled = 0
-    for pivot in range(seen.shape[0]):
-        count, aligned = aligned_neighbours(seen, pivot, radius, buffer, polar, rows)
+    for pivot in range(directions.shape[0]):
+        count, aligned = aligned_neighbours(directions, pivot, radius, buffer, polar, rows)
         if aligned < 0:
             continue
         votes = np.zeros(stars, dtype=np.int32)
-        count_votes(table, polar, count, aligned, radius, found, votes)
+        count_votes(table, polar, count, aligned, radius, occupied, votes)
         filled = add_winners(votes, MIN_VOTES, pivot, matches, filled)
     return matches[:filled]
 

@@ -57,7 +57,7 @@ def _lookup(
     """Find, for each pivot and alignment, the two best matches (m, 2) above the Bayesian threshold."""
     directions, magnitude = seen
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
-    found = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+    occupied = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     matches = np.empty((directions.shape[0] * ALIGNMENTS * KEPT, 2), dtype=np.int64)
     filled = 0
     hit, miss = math.log(HIT_RATE / fill), math.log((1.0 - HIT_RATE) / (1.0 - fill))
@@ -68,7 +68,7 @@ def _lookup(
             if aligned < 0:
                 break
             votes = np.zeros(stars, dtype=np.int32)
-            cells = count_votes(table, polar, count, aligned, radius, found, votes)
+            cells = count_votes(table, polar, count, aligned, radius, occupied, votes)
             for _ in range(KEPT):
                 best = np.argmax(votes)
                 odds = votes[best] * hit + (cells - votes[best]) * miss

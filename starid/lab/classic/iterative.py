@@ -32,13 +32,13 @@ ROUNDS: Final = 4
 
 
 @compiled_ieee
-def _vote_of_candidates(table: PairTable, candidate: Mask, seen: Array, tolerance: float) -> Indices32:
+def _vote_of_candidates(table: PairTable, candidate: Mask, directions: Array, tolerance: float) -> Indices32:
     """Votes (n, N) of catalogue pairs whose stars are candidates of an observed pair, in either order."""
-    n = seen.shape[0]
+    n = directions.shape[0]
     votes = np.zeros(candidate.shape, dtype=np.int32)
     for i in range(n):
         for j in range(i + 1, n):
-            distance = chord_between(seen, i, seen, j)
+            distance = chord_between(directions, i, directions, j)
             start, end = pair_range(table, distance - tolerance, distance + tolerance)
             for pair in range(start, end):
                 a, b = table.first[pair], table.second[pair]
@@ -64,13 +64,13 @@ class IterativeIdentifier(ClassicIdentifier):
         return tuple(self.pairs)
 
     def _match(self, observed: Observed) -> Indices:
-        seen, tolerance = observed.directions, observed.tolerance
-        votes = votes_of(self.pairs, len(self.guide), seen, tolerance)
+        directions, tolerance = observed.directions, observed.tolerance
+        votes = votes_of(self.pairs, len(self.guide), directions, tolerance)
         share = FIRST_SHARE
         candidate = _above(votes, share)
         for _ in range(ROUNDS):
             share += RISE
-            votes = _vote_of_candidates(self.pairs, candidate, seen, tolerance)
+            votes = _vote_of_candidates(self.pairs, candidate, directions, tolerance)
             candidate = _above(votes, share)
             if candidate.sum(axis=1).max(initial=0) <= 1:
                 break

@@ -95,17 +95,20 @@ def _most_agreeing(shifts: NDArray[np.int16], agreeing: Indices32) -> None:
 
 @compiled_ieee
 def _compare(
-    index: tuple[Indices32, NDArray[np.uint16], NDArray[np.uint8]], stars: int, seen: Array, radius: float
+    index: tuple[Indices32, NDArray[np.uint16], NDArray[np.uint8]],
+    stars: int,
+    directions: Array,
+    radius: float,
 ) -> Indices:
     """Match (m, 2) each observed star with the guide stars most similar to it."""
     start, owner, sectors = index
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     code, shifts = np.empty(SECTORS, dtype=np.uint8), np.empty((stars, SECTORS), dtype=np.int16)
-    matches = np.empty((seen.shape[0] * MAX_TIED, 2), dtype=np.int64)
+    matches = np.empty((directions.shape[0] * MAX_TIED, 2), dtype=np.int64)
     agreeing = np.empty(stars, dtype=np.int32)
     filled = 0
-    for pivot in range(seen.shape[0]):
-        log_polar_string(seen, pivot, radius, polar, rows, code)
+    for pivot in range(directions.shape[0]):
+        log_polar_string(directions, pivot, radius, polar, rows, code)
         shifts[:] = 0
         for place in range(SECTORS):
             ring = int(code[place]) - 1

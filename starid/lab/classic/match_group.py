@@ -38,7 +38,7 @@ GROUPS: Final = 5
 def match_groups(
     table: PairTable,
     guide: tuple[Array, Array],
-    seen: tuple[Array, Array],
+    observed: tuple[Array, Array],
     pole: int,
     tolerance: float,
     partner: Indices32,
@@ -46,7 +46,7 @@ def match_groups(
 ) -> None:
     """Fill in a pole's match groups: partner (N, n) of each candidate for each neighbour or −1; size (N,)."""
     vectors, magnitudes = guide
-    directions, instrumental = seen
+    directions, instrumental = observed
     partner[:] = -1
     size[:] = 0
     for j in range(directions.shape[0]):
@@ -61,12 +61,12 @@ def match_groups(
                 b = int(table.second[pair]) if side == 0 else int(table.first[pair])
                 if abs(magnitudes[b] - magnitudes[a] - difference) > MAGNITUDE_GATE:
                     continue
-                known = int(partner[a, j])
-                if known < 0:
+                earlier = int(partner[a, j])
+                if earlier < 0:
                     size[a] += 1
                     partner[a, j] = b
                 elif abs(table.chord[pair] - distance) < abs(
-                    chord_between(vectors, a, vectors, known) - distance
+                    chord_between(vectors, a, vectors, earlier) - distance
                 ):
                     partner[a, j] = b
 
@@ -87,10 +87,10 @@ def group_pairs(partner: Indices32, pole: int, candidate: int) -> Indices:
 
 @compiled_ieee
 def _largest_match_group(
-    table: PairTable, guide: tuple[Array, Array], seen: tuple[Array, Array], tolerance: float
+    table: PairTable, guide: tuple[Array, Array], observed: tuple[Array, Array], tolerance: float
 ) -> Indices:
     """Find the matches (m, 2) of the largest group that agrees in all distances."""
-    vectors, directions = guide[0], seen[0]
+    vectors, directions = guide[0], observed[0]
     n = directions.shape[0]
     partner, size = (
         np.empty((vectors.shape[0], n), dtype=np.int32),
@@ -99,7 +99,7 @@ def _largest_match_group(
     members = np.empty(n + 1, dtype=np.int64)
     best = np.empty((0, 2), dtype=np.int64)
     for pole in range(min(n, POLES)):
-        match_groups(table, guide, seen, pole, tolerance, partner, size)
+        match_groups(table, guide, observed, pole, tolerance, partner, size)
         for _ in range(GROUPS):
             candidate = int(np.argmax(size))
             if size[candidate] < best.shape[0]:

@@ -61,15 +61,15 @@ def _shaded_patterns(vectors: Array, radius: float, buffer: float) -> NDArray[np
 
 @compiled_ieee
 def _least_cost(
-    grey: NDArray[np.uint8], seen: Array, magnitude: Array, radius: float, buffer: float
+    grey: NDArray[np.uint8], directions: Array, magnitude: Array, radius: float, buffer: float
 ) -> Indices:
     """Find the guide star of each observed star; −1 without a clear winner."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     cells, weights = np.empty(MAX_NEIGHBOURS, dtype=np.int64), np.empty(MAX_NEIGHBOURS)
-    matched = np.full(seen.shape[0], -1, dtype=np.int64)
+    matched = np.full(directions.shape[0], -1, dtype=np.int64)
     brightest, range_of = magnitude[0], max(magnitude[-1] - magnitude[0], 1e-9)
-    for pivot in range(seen.shape[0]):
-        count, aligned = aligned_neighbours(seen, pivot, radius, buffer, polar, rows)
+    for pivot in range(directions.shape[0]):
+        count, aligned = aligned_neighbours(directions, pivot, radius, buffer, polar, rows)
         if aligned < 0 or count < MIN_NEIGHBOURS:
             continue
         whole = 0.0

@@ -38,13 +38,13 @@ MIN_POLES: Final = 2
 
 
 @compiled_ieee
-def _verified(table: PairTable, stars: int, seen: Array, tolerance: float) -> Indices:
+def _verified(table: PairTable, stars: int, directions: Array, tolerance: float) -> Indices:
     """Matches (m, 2) that the most poles accept, at least `MIN_POLES`."""
-    n = seen.shape[0]
+    n = directions.shape[0]
     partners = [(0, 0, 0)]
     votes, accepted = np.empty(stars, dtype=np.int64), np.zeros((n, stars), dtype=np.int32)
     for pole in range(n):
-        pole_partners(table, seen, pole, tolerance, partners, votes)
+        pole_partners(table, directions, pole, tolerance, partners, votes)
         for _ in range(IDENTITIES):
             identity = int(np.argmax(votes))
             if votes[identity] < MIN_ACCEPTED:

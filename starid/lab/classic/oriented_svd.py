@@ -41,7 +41,7 @@ def _triangle_rows(vectors: Array, radius: float, buffer: float) -> Indices:
     """Corners (m, 3) of the triangles of each star and two of its neighbours, unordered, with repeats."""
     n = vectors.shape[0]
     polar, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
-    found = np.empty((n * (NEIGHBOURS * (NEIGHBOURS - 1) // 2), 3), dtype=np.int64)
+    triangles = np.empty((n * (NEIGHBOURS * (NEIGHBOURS - 1) // 2), 3), dtype=np.int64)
     filled = 0
     for star in range(n):
         count = neighbours_of(vectors, star, radius, polar, rows)
@@ -51,9 +51,9 @@ def _triangle_rows(vectors: Array, radius: float, buffer: float) -> Indices:
         last = min(first + NEIGHBOURS, count)
         for i in range(first, last):
             for j in range(i + 1, last):
-                found[filled, 0], found[filled, 1], found[filled, 2] = star, rows[i], rows[j]
+                triangles[filled, 0], triangles[filled, 1], triangles[filled, 2] = star, rows[i], rows[j]
                 filled += 1
-    return found[:filled]
+    return triangles[:filled]
 
 
 def oriented_triangles(vectors: Array, corners: Indices) -> tuple[Indices, Array, NDArray[np.int8]]:

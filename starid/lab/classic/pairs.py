@@ -128,7 +128,7 @@ def pair_range(table: PairTable, low: float, high: float) -> tuple[int, int]:
 @inner
 def pole_partners(
     table: PairTable,
-    seen: Array,
+    directions: Array,
     pole: int,
     tolerance: float,
     partners: list[tuple[int, int, int]],
@@ -140,7 +140,7 @@ def pole_partners(
     ----------
     table
         The catalogue pairs.
-    seen
+    directions
         Directions of the observed stars, (n, 3).
     pole
         Row of the pole.
@@ -154,10 +154,10 @@ def pole_partners(
     partners.clear()
     explained[:] = 0
     last = np.full(explained.shape[0], -1, dtype=np.int64)
-    for j in range(seen.shape[0]):
+    for j in range(directions.shape[0]):
         if j == pole:
             continue
-        distance = chord_between(seen, pole, seen, j)
+        distance = chord_between(directions, pole, directions, j)
         start, end = pair_range(table, distance - tolerance, distance + tolerance)
         for pair in range(start, end):
             for side in range(2):

@@ -31,23 +31,23 @@ CANDIDATES: Final = 8
 
 @compiled_ieee
 def _candidates(
-    table: tuple[Indices32, NDArray[np.uint16]], stars: int, seen: Array, radius: float
+    table: tuple[Indices32, NDArray[np.uint16]], stars: int, directions: Array, radius: float
 ) -> Indices:
     """Candidates (m, 2): row of an observed star, and a guide star with enough rings in common."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     votes = np.empty(stars, dtype=np.int32)
-    found = np.empty((seen.shape[0] * CANDIDATES, 2), dtype=np.int64)
+    candidates = np.empty((directions.shape[0] * CANDIDATES, 2), dtype=np.int64)
     filled = 0
-    for pole in range(seen.shape[0]):
-        radial_votes(table, polar, neighbours_of(seen, pole, radius, polar, rows), radius, votes)
+    for pole in range(directions.shape[0]):
+        radial_votes(table, polar, neighbours_of(directions, pole, radius, polar, rows), radius, votes)
         for _ in range(CANDIDATES):
             best = np.argmax(votes)
             if votes[best] < MIN_VOTES:
                 break
             votes[best] = 0
-            found[filled, 0], found[filled, 1] = pole, best
+            candidates[filled, 0], candidates[filled, 1] = pole, best
             filled += 1
-    return found[:filled]
+    return candidates[:filled]
 
 
 class PoleStarIdentifier(ClassicIdentifier):

@@ -55,7 +55,7 @@ def _link_partners(
 def _unique_triangle(
     table: PairTable,
     vectors: Array,
-    seen: Array,
+    directions: Array,
     triad: tuple[int, int, int],
     tolerance: float,
     work: tuple[Indices, Indices],
@@ -64,13 +64,13 @@ def _unique_triangle(
     i, j, k = triad
     head, link = work
     ij, ik, jk = (
-        chord_between(seen, i, seen, j),
-        chord_between(seen, i, seen, k),
-        chord_between(seen, j, seen, k),
+        chord_between(directions, i, directions, j),
+        chord_between(directions, i, directions, k),
+        chord_between(directions, j, directions, k),
     )
-    hand = _triple_product(seen, i, j, k)
+    hand = _triple_product(directions, i, j, k)
     start, end = _link_partners(table, ik - tolerance, ik + tolerance, head, link)
-    found, fa, fb, fc = 0, -1, -1, -1
+    count, fa, fb, fc = 0, -1, -1, -1
     first, last = pair_range(table, ij - tolerance, ij + tolerance)
     for pair in range(first, last):
         for side in range(2):
@@ -85,22 +85,22 @@ def _unique_triangle(
                     and abs(chord_between(vectors, b, vectors, c) - jk) <= tolerance
                     and _triple_product(vectors, a, b, c) * hand > 0.0
                 ):
-                    found, fa, fb, fc = found + 1, a, b, c
+                    count, fa, fb, fc = count + 1, a, b, c
                 place = link[place]
-            if found > 1:
+            if count > 1:
                 break
-        if found > 1:
+        if count > 1:
             break
     for pair in range(start, end):
         head[table.first[pair]] = -1
         head[table.second[pair]] = -1
-    return found, fa, fb, fc
+    return count, fa, fb, fc
 
 
 @inner
 def _fourth_star(
     vectors: Array,
-    seen: Array,
+    directions: Array,
     triad: tuple[int, int, int],
     stars: tuple[int, int, int],
     r: int,
@@ -108,11 +108,11 @@ def _fourth_star(
 ) -> int:
     """Find the catalogue star whose distances to the triangle fit observed star r; −1 unless unique."""
     d0, d1, d2 = (
-        chord_between(seen, triad[0], seen, r),
-        chord_between(seen, triad[1], seen, r),
-        chord_between(seen, triad[2], seen, r),
+        chord_between(directions, triad[0], directions, r),
+        chord_between(directions, triad[1], directions, r),
+        chord_between(directions, triad[2], directions, r),
     )
-    found = -1
+    match = -1
     for star in range(vectors.shape[0]):
         if (
             abs(chord_between(vectors, stars[0], vectors, star) - d0) <= tolerance
@@ -120,16 +120,16 @@ def _fourth_star(
             and abs(chord_between(vectors, stars[2], vectors, star) - d2) <= tolerance
             and star not in stars
         ):
-            if found >= 0:
+            if match >= 0:
                 return -1
-            found = star
-    return found
+            match = star
+    return match
 
 
 @inner
 def _complete(
     vectors: Array,
-    seen: Array,
+    directions: Array,
     triad: tuple[int, int, int],
     stars: tuple[int, int, int],
     tolerance: float,
@@ -140,17 +140,17 @@ def _complete(
     for corner in range(3):
         matched[triad[corner]] = stars[corner]
     count = 0
-    for r in range(seen.shape[0]):
+    for r in range(directions.shape[0]):
         if r not in triad:
-            matched[r] = _fourth_star(vectors, seen, triad, stars, r, tolerance)
+            matched[r] = _fourth_star(vectors, directions, triad, stars, r, tolerance)
             count += 1 if matched[r] >= 0 else 0
     return count
 
 
 @compiled_ieee
-def _pyramid(table: PairTable, vectors: Array, seen: Array, tolerance: float) -> Indices:
+def _pyramid(table: PairTable, vectors: Array, directions: Array, tolerance: float) -> Indices:
     """Guide star of each observed star or −1, from the first triad that is unique and confirmed."""
-    n = seen.shape[0]
+    n = directions.shape[0]
     matched = np.full(n, -1, dtype=np.int64)
     head = np.full(vectors.shape[0], -1, dtype=np.int64)
     work = (head, np.empty(2 * table.chord.shape[0], dtype=np.int64))
@@ -158,9 +158,9 @@ def _pyramid(table: PairTable, vectors: Array, seen: Array, tolerance: float) ->
         for dk in range(1, n - dj):
             for i in range(n - dj - dk):
                 triad = (i, i + dj, i + dj + dk)
-                found, a, b, c = _unique_triangle(table, vectors, seen, triad, tolerance, work)
+                found, a, b, c = _unique_triangle(table, vectors, directions, triad, tolerance, work)
                 if found == 1 and (
-                    _complete(vectors, seen, triad, (a, b, c), tolerance, matched) > 0 or n == 3
+                    _complete(vectors, directions, triad, (a, b, c), tolerance, matched) > 0 or n == 3
                 ):
                     return matched
     return np.full(n, -1, dtype=np.int64)

@@ -59,12 +59,12 @@ def bits(word: int) -> int:
 
 
 @inner
-def common_sectors(seen: int, other: int) -> int:
+def common_sectors(word: int, other: int) -> int:
     """Number of sectors that two words have in common, to within one sector, at the best shift."""
     wide = other | rotated(other, 1) | rotated(other, SECTORS - 1)
     best = 0
     for shift in range(SECTORS):
-        best = max(best, bits(rotated(seen, shift) & wide))
+        best = max(best, bits(rotated(word, shift) & wide))
     return best
 
 
@@ -80,14 +80,14 @@ def _cyclic_words(vectors: Array, radius: float) -> Indices:
 
 @compiled_ieee
 def _identify(
-    table: tuple[Indices32, NDArray[np.uint16]], words: Indices, seen: Array, radius: float
+    table: tuple[Indices32, NDArray[np.uint16]], words: Indices, directions: Array, radius: float
 ) -> Indices:
     """Find the guide star of each observed star; −1 without a clear winner."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     votes = np.empty(words.shape[0], dtype=np.int32)
-    matched = np.full(seen.shape[0], -1, dtype=np.int64)
-    for pole in range(seen.shape[0]):
-        count = neighbours_of(seen, pole, radius, polar, rows)
+    matched = np.full(directions.shape[0], -1, dtype=np.int64)
+    for pole in range(directions.shape[0]):
+        count = neighbours_of(directions, pole, radius, polar, rows)
         radial_votes(table, polar, count, radius, votes)
         word = cyclic_word(polar, count, radius)
         best, most, second = -1, 0, 0

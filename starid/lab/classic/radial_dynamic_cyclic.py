@@ -54,30 +54,30 @@ def most_in_window(angles: Array, count: int, window: float) -> int:
 @inner
 def likeness(polar: Array, count: int, other: Array32, tolerance: float, angles: Array) -> int:
     """Count the neighbours, in order of distance, that two stars have in common at the best angle between them."""
-    found, first = 0, 0
+    pairs, first = 0, 0
     for i in range(count):
         while first < other.shape[0] and other[first, 0] < polar[i, 0] - tolerance:
             first += 1
         j = first
-        while j < other.shape[0] and other[j, 0] <= polar[i, 0] + tolerance and found < angles.shape[0]:
-            angles[found] = turned(other[j, 1], polar[i, 1])
-            found += 1
+        while j < other.shape[0] and other[j, 0] <= polar[i, 0] + tolerance and pairs < angles.shape[0]:
+            angles[pairs] = turned(other[j, 1], polar[i, 1])
+            pairs += 1
             j += 1
-    return most_in_window(angles, found, WINDOW) if found >= MIN_LIKENESS else 0
+    return most_in_window(angles, pairs, WINDOW) if pairs >= MIN_LIKENESS else 0
 
 
 @compiled_ieee
-def _compare(patterns: Patterns, seen: Array, radius: float, tolerance: float) -> Indices:
+def _compare(patterns: Patterns, directions: Array, radius: float, tolerance: float) -> Indices:
     """Match (m, 2) each observed star with the guide stars most similar to it."""
     start, others, _ = patterns
-    n, stars = seen.shape[0], start.shape[0] - 1
+    n, stars = directions.shape[0], start.shape[0] - 1
     polar, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
     angles = np.empty(16 * n)
     matches = np.empty((n * MAX_TIED, 2), dtype=np.int64)
     similar = np.empty(stars, dtype=np.int32)
     filled = 0
     for pole in range(n):
-        count = neighbours_of(seen, pole, radius, polar, rows)
+        count = neighbours_of(directions, pole, radius, polar, rows)
         for star in range(stars):
             pattern = others[start[star] : start[star + 1]]
             similar[star] = likeness(polar, count, pattern, tolerance, angles)

@@ -227,11 +227,11 @@ class ClassicIdentifier(VerifiedIdentifier):
 
     def _guide_stars(self, per_field: float) -> GuideStars:
         """Choose the brightest stars, as the camera resolves them, with a mean number per field."""
-        wanted = math.ceil(per_field * 4.0 * math.pi / self._area_sr)
+        on_sky = math.ceil(per_field * 4.0 * math.pi / self._area_sr)
         magnitudes = np.sort(self._catalog.v)
         if magnitudes.size < MIN_GUIDE_STARS:
             raise StaridError(f"classic catalog: {magnitudes.size} stars, at least {MIN_GUIDE_STARS} needed")
-        limit = float(magnitudes[-1 if self.options.even else min(wanted, magnitudes.size) - 1])
+        limit = float(magnitudes[-1 if self.options.even else min(on_sky, magnitudes.size) - 1])
         if self.options.limiting_magnitude is not None:
             limit = min(limit, self.options.limiting_magnitude)
         stars = resolved_stars(self._catalog, limit, BLEND_PX / self._px_per_rad)
@@ -289,21 +289,21 @@ class ClassicIdentifier(VerifiedIdentifier):
 
     def _raw(self, xy: Array, observed: Observed, pairs: Indices) -> Solution:
         """Fit the attitude to the matched stars by least squares, without verification."""
-        seen, stars = observed.directions[pairs[:, 0]], self.guide.vectors[pairs[:, 1]]
-        attitude = solve_wahba(seen, stars)
+        directions, stars = observed.directions[pairs[:, 0]], self.guide.vectors[pairs[:, 1]]
+        attitude = solve_wahba(directions, stars)
         expected, _ = self._camera.project(attitude.to_sensor(stars))
-        found, rows = observed.row[pairs[:, 0]], self.guide.row[pairs[:, 1]]
-        square = float(np.mean(np.sum((expected - xy[found]) ** 2, axis=1)))
+        detections, rows = observed.row[pairs[:, 0]], self.guide.row[pairs[:, 1]]
+        square = float(np.mean(np.sum((expected - xy[detections]) ** 2, axis=1)))
         freedom = max(2 * len(pairs) - 3, 1)
         sigma_px = math.sqrt(max(square * len(pairs) / freedom, 1e-12))
         return Solution(
             valid=True,
             reason=Reason.OK,
             quaternion_xyzw=attitude.quaternion_xyzw,
-            detection_index=found,
+            detection_index=detections,
             catalog_index=rows,
             hip=self._catalog.hip[rows],
-            covariance=covariance(seen, sigma_px / self._px_per_rad),
+            covariance=covariance(directions, sigma_px / self._px_per_rad),
             rms_px=math.sqrt(square),
             sigma_px=sigma_px,
         )

@@ -61,13 +61,15 @@ def simplest_size(stars: int, width_rad: float, tolerance: float) -> int:
 
 
 @compiled_ieee
-def _subgraphs(table: PairTable, vectors: Array, seen: Array, tolerance: float, least: int) -> list[Indices]:
+def _subgraphs(
+    table: PairTable, vectors: Array, directions: Array, tolerance: float, least: int
+) -> list[Indices]:
     """List the subgraphs (m, 2), of at least `least` stars, that agree in all distances."""
-    found = [np.empty((0, 2), dtype=np.int64)]
+    groups = [np.empty((0, 2), dtype=np.int64)]
     partners = [(0, 0, 0)]
     size = np.empty(vectors.shape[0], dtype=np.int64)
-    for pole in range(min(seen.shape[0], POLES)):
-        pole_partners(table, seen, pole, tolerance, partners, size)
+    for pole in range(min(directions.shape[0], POLES)):
+        pole_partners(table, directions, pole, tolerance, partners, size)
         for _ in range(GROUPS):
             candidate = np.argmax(size)
             if size[candidate] + 1 < least:
@@ -81,10 +83,10 @@ def _subgraphs(table: PairTable, vectors: Array, seen: Array, tolerance: float, 
                     count += 1
             size[candidate] = 0
             members = np.empty(count, dtype=np.int64)
-            size_of_group = group_around(seen, vectors, pairs[:count], 0, tolerance, members)
+            size_of_group = group_around(directions, vectors, pairs[:count], 0, tolerance, members)
             if size_of_group >= least:
-                found.append(pairs[members[:size_of_group]])
-    return found
+                groups.append(pairs[members[:size_of_group]])
+    return groups
 
 
 class SubgraphIdentifier(ClassicIdentifier):

@@ -42,14 +42,14 @@ def _pattern_rows(vectors: Array, radius: float, buffer: float) -> Indices:
     """Rows (n, `PATTERN`) of each star and its nearest neighbours beyond a buffer; −1 if too few."""
     n = vectors.shape[0]
     polar, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
-    found = np.full((n, PATTERN), -1, dtype=np.int64)
+    patterns = np.full((n, PATTERN), -1, dtype=np.int64)
     for star in range(n):
         count = neighbours_of(vectors, star, radius, polar, rows)
         first = nearest_beyond(polar, count, buffer)
         if first >= 0 and count - first >= PATTERN - 1:
-            found[star, 0] = star
-            found[star, 1:] = rows[first : first + PATTERN - 1]
-    return found
+            patterns[star, 0] = star
+            patterns[star, 1:] = rows[first : first + PATTERN - 1]
+    return patterns
 
 
 def singular_attitude(seen: Array, stars: Array) -> Array:
@@ -79,19 +79,19 @@ class SvdIdentifier(ClassicIdentifier):
 
     def _match(self, observed: Observed) -> Indices:
         patterns = _pattern_rows(observed.directions, self._radius, self._buffer)
-        found: list[Indices] = []
+        matches: list[Indices] = []
         for pattern in patterns[patterns[:, 0] >= 0]:
             stars = self._confirmed(observed, pattern)
             if stars is not None:
-                found.append(np.column_stack([pattern, stars]))
-            if len(found) == CONFIRMED:
+                matches.append(np.column_stack([pattern, stars]))
+            if len(matches) == CONFIRMED:
                 break
-        return np.concatenate(found) if found else np.empty((0, 2), dtype=np.int64)
+        return np.concatenate(matches) if matches else np.empty((0, 2), dtype=np.int64)
 
     def _confirmed(self, observed: Observed, pattern: Indices) -> Indices | None:
         """Guide stars of an observed pattern, from the one key whose attitude fits all its stars."""
-        seen = observed.directions[pattern].T
-        key = np.linalg.svd(seen, compute_uv=False)[1:]
+        directions = observed.directions[pattern].T
+        key = np.linalg.svd(directions, compute_uv=False)[1:]
         # a singular value moves by at most the norm of the errors (Weyl): five stars, one sigma of the
         # tolerance each
         reach = observed.tolerance / math.sqrt(2.0) * math.sqrt(PATTERN) / 2.0
@@ -101,7 +101,7 @@ class SvdIdentifier(ClassicIdentifier):
         for row in near:
             rows = self.rows[row].astype(np.int64)
             stars = self.guide.vectors[rows].T
-            error = seen - singular_attitude(seen, stars) @ stars
+            error = directions - singular_attitude(directions, stars) @ stars
             largest = float(np.max(np.linalg.norm(error, axis=0)))
             if largest <= least:
                 best, least = rows, largest

@@ -72,17 +72,17 @@ def _patterns(vectors: Array, radius: float, buffer: float) -> tuple[Indices32, 
 def _vote(
     index: tuple[Indices32, NDArray[np.uint16], Array32],
     stars: int,
-    seen: Array,
+    directions: Array,
     radius: float,
     buffer: float,
 ) -> Indices:
     """Match (m, 2) each observed star, as the pivot, with the guide stars that have the most votes."""
     start, owner, angles = index
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
-    matches = np.empty((seen.shape[0] * MAX_TIED, 2), dtype=np.int64)
+    matches = np.empty((directions.shape[0] * MAX_TIED, 2), dtype=np.int64)
     filled = 0
-    for pivot in range(seen.shape[0]):
-        count, aligned = aligned_neighbours(seen, pivot, radius, buffer, polar, rows)
+    for pivot in range(directions.shape[0]):
+        count, aligned = aligned_neighbours(directions, pivot, radius, buffer, polar, rows)
         if aligned < 0:
             continue
         votes, voter = np.zeros(stars, dtype=np.int32), np.full(stars, -1, dtype=np.int64)

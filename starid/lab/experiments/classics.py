@@ -78,13 +78,13 @@ def _identify_frames(
     return errors, times
 
 
-def _distance(sky: SkyName, found: tuple[float, float], true: tuple[float, float]) -> float:
+def _distance(sky: SkyName, answer: tuple[float, float], true: tuple[float, float]) -> float:
     """Error of a boresight, degrees, in the plane or on the sphere."""
     if sky == "flat":
-        return float(boresight_error(*found, *true))
+        return float(boresight_error(*answer, *true))
     a, b = (
         np.array([math.cos(d) * math.cos(r), math.cos(d) * math.sin(r), math.sin(d)])
-        for r, d in (np.radians(found), np.radians(true))
+        for r, d in (np.radians(answer), np.radians(true))
     )
     return math.degrees(2.0 * math.asin(min(0.5 * float(np.linalg.norm(a - b)), 1.0)))
 
@@ -171,14 +171,14 @@ def _compare(e: Evaluation, lines: list[dict[str, Any]]) -> None:
             )
     # the first sky is the flat one if both are selected
     for name in IN_TABLE_6_2:
-        found = e.results.get(f"{skies[0]}-{name}")
-        if found is None:
+        result = e.results.get(f"{skies[0]}-{name}")
+        if result is None:
             continue
         size, milliseconds = e.published(f"table 6.2, {name}")
-        here, papers, build = (float(figure) for figure in found["kb"])
+        here, papers, build = (float(figure) for figure in result["kb"])
         at_sensor = "" if math.isnan(papers) else f"12° sensor: {papers:.0f} kB, built in {build:.2f} s"
         e.compare(f"{SHORT[name]}: database", text=size, unit="kB", digits=0, ours=here, remark=at_sensor)
-        median = float(np.median(found["ms_none"]))
+        median = float(np.median(result["ms_none"]))
         e.compare(f"{SHORT[name]}: median time, no noise", text=milliseconds, unit="ms", ours=median)
 
 
@@ -194,7 +194,7 @@ def _figures(e: Evaluation, lines: list[dict[str, Any]]) -> None:
         members = [line | {"level": levels[line["case"]]} for line in lines if line["case"] in levels]
         if not any(line["level"] for line in members):
             continue
-        known = [
+        published = [
             Curve([level], e.published(f"{name}, {case}"), "x", "", {"color": "red", "ms": 7})
             for (case, level), name in itertools.product(levels.items(), SHORT)
             if e.published(f"{name}, {case}")
@@ -204,7 +204,7 @@ def _figures(e: Evaluation, lines: list[dict[str, Any]]) -> None:
             rates = [line for line in members if line["sky"] == sky]
             curves = curves_of(rates, "level", "identified_percent", lambda line: SHORT[line["algorithm"]])
             settings = {"xlabel": label, "ylabel": "identified / %", "xticks": range(4), "ylim": (0, 102)}
-            shown.append(Panel(_SKY_LABELS[sky], [*curves, *known], settings))
+            shown.append(Panel(_SKY_LABELS[sky], [*curves, *published], settings))
         look = {"columns": len(shown), "width": 5.5 * len(shown), "height": 4.4, "legend": "best"}
         e.draw(f"figure_6_{number}_classics.png", shown, **look)
 

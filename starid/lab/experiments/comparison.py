@@ -177,23 +177,23 @@ _BOUNDS: Final[dict[str, tuple[Kind, Callable[[Any, Any], bool]]]] = {
 }
 
 
-def _tolerance(known: Published, trials: int) -> Tolerance:
-    word, _, rest = known.check.partition(" ")
+def _tolerance(published: Published, trials: int) -> Tolerance:
+    word, _, rest = published.check.partition(" ")
     if word == "same":
         return 0.0, "the same"
     if word in ("digit", "rounding"):
-        return _rounding(known.digits if word == "digit" else int(rest), known.unit)
+        return _rounding(published.digits if word == "digit" else int(rest), published.unit)
     if word in _SAMPLED:
         what, unit, error_of = _SAMPLED[word]
         arguments = [float(each) for each in rest.split()] or [trials]
-        error = error_of(known.numbers[0], *arguments)
+        error = error_of(published.numbers[0], *arguments)
         return error, f"3 standard errors of two {what} of {arguments[-1]:g}, {error:.2g}{unit}"
     return float(word), rest
 
 
 def compared(
     quantity: str,
-    known: Published,
+    entry: Published,
     *,
     author: Any = None,
     printed: Any = None,
@@ -211,20 +211,20 @@ def compared(
     ReproduceError
         There is no number to check.
     """
-    numbers, unit = known.numbers, known.unit
-    published = known.text if not numbers else numbers[0] if len(numbers) == 1 else numbers
+    numbers, unit = entry.numbers, entry.unit
+    published = entry.text if not numbers else numbers[0] if len(numbers) == 1 else numbers
     one, two, three, four = (
-        value_text(each, unit, known.digits) for each in (published, ours, author, printed)
+        value_text(each, unit, entry.digits) for each in (published, ours, author, printed)
     )
-    informing = Row(quantity, one, two, author=three, printed=four, remark=f"{known.remark} {remark}".strip())
-    if not known.check:
+    informing = Row(quantity, one, two, author=three, printed=four, remark=f"{entry.remark} {remark}".strip())
+    if not entry.check:
         return informing
     checked = next((value for value in (author, printed, ours) if value is not None), None)
     if checked is None or isinstance(checked, str):
         raise ReproduceError(
             f"reproduce: {quantity}: there is no number to compare; give author, printed or ours"
         )
-    word, _, rest = known.check.partition(" ")
+    word, _, rest = entry.check.partition(" ")
     if word in _BOUNDS:
         kind, holds = _BOUNDS[word]
         return _checked(
@@ -234,8 +234,8 @@ def compared(
             [holds(checked, float(rest))],
         )
     if word in ("more", "less"):
-        return _improved(informing, known, checked, numbers[0], larger=word == "more")
-    largest, origin = _tolerance(known, trials)
+        return _improved(informing, entry, checked, numbers[0], larger=word == "more")
+    largest, origin = _tolerance(entry, trials)
     matches = [bool(abs(a - b) <= largest) for a, b in zip(np.atleast_1d(checked), numbers, strict=True)]
     target = origin if word == "same" else f"± {origin}" if len(numbers) == 1 else f"each ± {origin}"
     interval = (numbers[0] - largest, numbers[0] + largest) if len(numbers) == 1 else ()

@@ -23,10 +23,11 @@ from numpy.typing import NDArray
 
 from starid.catalog import StarCatalog, load_catalog
 from starid.catalog.hipparcos import EPOCH
+from starid.identification.options import Solver
 from starid.identification.thesis.database import DatabaseParameters, FeatureDatabase, build_database, sky_of
 from starid.identification.thesis.database_file import load_database, save_database
 from starid.identification.thesis.frame_sky import FrameSky
-from starid.identification.thesis.lsi import LostInSpace, Solver
+from starid.identification.thesis.lsi import LostInSpace
 from starid.lab.experiments.comparison import (
     Outcome,
     Published,
@@ -213,7 +214,7 @@ class Evaluation:
         self.rows.append(compared(quantity, line, **readings))
 
     def compare_line(
-        self, table: str, part: str, where: str, known: Mapping[str, float], measured: Mapping[str, Any]
+        self, table: str, part: str, where: str, published: Mapping[str, float], measured: Mapping[str, Any]
     ) -> None:
         """Add a row for each measured column of a line of a large table, as `columns.csv` describes the column.
 
@@ -224,10 +225,10 @@ class Evaluation:
             column = COLUMNS[table][name]
             self.compare(
                 column["words"].format(where=where),
-                text=known[name],
+                text=published[name],
                 unit=column["unit"],
                 digits=int(column["digits"]),
-                check=column["check"].format(**known),
+                check=column["check"].format(**published),
                 column=f"{table} {part} {name}",
                 **(values if isinstance(values, Mapping) else {"author": values}),
             )

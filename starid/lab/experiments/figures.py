@@ -80,25 +80,25 @@ def curves_of(
     style: str = "o-",
 ) -> list[Curve]:
     """A curve for each label of lines of a table, through the values of two columns."""
-    found: dict[str, list[Mapping[str, Any]]] = {}
+    by_label: dict[str, list[Mapping[str, Any]]] = {}
     for line in table:
-        found.setdefault(label(line), []).append(line)
+        by_label.setdefault(label(line), []).append(line)
     return [
         Curve([line[x] for line in lines], [line[y] for line in lines], style, words)
-        for words, lines in found.items()
+        for words, lines in by_label.items()
     ]
 
 
 def panels_of(content: Iterable[Panel | Picture | tuple[str, Curve]]) -> list[Panel | Picture]:
     """Panels in order; curves with the same title share one."""
-    found: dict[str | int, Panel | Picture] = {}
+    panels: dict[str | int, Panel | Picture] = {}
     for number, each in enumerate(content):
         if isinstance(each, Panel | Picture):
-            found[number] = each
+            panels[number] = each
         else:
-            panel = found.setdefault(each[0], Panel(each[0], []))
+            panel = panels.setdefault(each[0], Panel(each[0], []))
             panel.curves.append(each[1])  # type: ignore[union-attr]
-    return list(found.values())
+    return list(panels.values())
 
 
 def _picture(fig: Any, axis: Any, picture: Picture) -> list[Any]:

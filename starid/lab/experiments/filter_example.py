@@ -63,17 +63,17 @@ def _disparities(before: ObservedFrame, now: ObservedFrame) -> tuple[Array, Mask
 def compute(context: Context, part: Part) -> Results:
     """Disparities, cluster and motion of the two frames, exact and to whole pixels."""
     before, now = _frames(context.rng(part.key))
-    found: Results = {}
+    results: Results = {}
     for name, frames in (("exact", (before, now)), ("pixels", (_to_pixels(before), _to_pixels(now)))):
         disparities, chosen = _disparities(*frames)
         result = ClusterFilter()(*frames)
         motion = matched_motion(*frames, result.matches, model="affine")
-        found[f"disparities_{name}"], found[f"chosen_{name}"] = disparities, chosen
-        found[f"stars_{name}"] = result.true_now
-        found[f"turn_{name}"] = np.array(math.nan if motion is None else motion.rotation_deg)
+        results[f"disparities_{name}"], results[f"chosen_{name}"] = disparities, chosen
+        results[f"stars_{name}"] = result.true_now
+        results[f"turn_{name}"] = np.array(math.nan if motion is None else motion.rotation_deg)
     for name, frame in (("before", before), ("now", now)):
-        found[name] = np.column_stack([frame.positions, frame.brightness])
-    return found
+        results[name] = np.column_stack([frame.positions, frame.brightness])
+    return results
 
 
 def _draw_clusters(e: Evaluation, result: Results) -> None:

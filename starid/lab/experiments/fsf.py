@@ -75,14 +75,14 @@ def motion_errors(motion: CameraMotion, frame: SimulatedFrame) -> tuple[float, f
 
 
 def author_distances(
-    first: ObservedFrame, now: ObservedFrame, found: MatlabFilter
+    first: ObservedFrame, now: ObservedFrame, star_filter: MatlabFilter
 ) -> tuple[Mask, tuple[float, float]]:
     """Run the author's filter: true stars of the later frame, and μ_d and σ_d of *all* pairs in the cluster.
 
     The motion is fitted to the inliers; the distances are NaN if there is none.
     """
-    pairs = found.pairs(first, now)
-    result = found.inliers(first, now, pairs)
+    pairs = star_filter.pairs(first, now)
+    result = star_filter.inliers(first, now, pairs)
     motion = matched_motion(first, now, result.matches, model="affine")
     if motion is None:
         return result.true_now, (math.nan, math.nan)
@@ -96,7 +96,7 @@ def _author(context: Context, part: Part) -> Results:
     starts, count = int(context.parameters["first_frames"]), int(context.parameters["frames"])
     counts = np.zeros((len(FACTORS), starts, count, 4), dtype=np.int64)
     distances = np.full((len(FACTORS), starts, count, 2), math.nan)
-    found = MatlabFilter(PIXEL_DEG)
+    star_filter = MatlabFilter(PIXEL_DEG)
     for k, factor in enumerate(FACTORS):
         noise = filter_noise(kind, factor, false_stars, stretch)
         for start in range(starts):
@@ -104,7 +104,7 @@ def _author(context: Context, part: Part) -> Results:
             first, _ = frames_of_seven(context.rng("first", false_stars, start), noise, 0)
             _, frames = frames_of_seven(context.rng(part.key, factor, start), noise, count)
             for i, frame in enumerate(frames):
-                taken, distances[k, start, i] = author_distances(first.observed, frame.observed, found)
+                taken, distances[k, start, i] = author_distances(first.observed, frame.observed, star_filter)
                 counts[k, start, i] = Confusion.of(taken, frame.is_star).counts
     return {"counts": counts, "distances": distances}
 

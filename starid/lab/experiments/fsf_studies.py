@@ -98,7 +98,7 @@ def evaluate_case(e: Evaluation) -> None:
     lines = []
     for part in e.parts:
         f, kind = part["false_stars"], part["kind"]
-        known, c = CASE_STUDY[f, kind], Confusion(*e[part]["counts"].tolist())
+        published, c = CASE_STUDY[f, kind], Confusion(*e[part]["counts"].tolist())
         errors = e[part]["errors"]
         mean, sigma = errors.mean(axis=0), errors.std(axis=0, ddof=1)
         indicators = ("accuracy", "precision", "recall")
@@ -107,10 +107,10 @@ def evaluate_case(e: Evaluation) -> None:
         for name, each, spread in zip(("rotation", "shift"), mean.tolist(), sigma.tolist(), strict=True):
             line |= {f"{name}_error_deg": each, f"{name}_sigma_deg": spread}
             measured |= {f"{name}_mean": {"printed": each}, f"{name}_sigma": {"printed": spread}}
-        line |= {f"published_{name}": 0.01 * known[name] for name in ("accuracy", "precision")}
-        line |= {f"published_{name}_error_deg": known[f"{name}_mean"] for name in ("rotation", "shift")}
+        line |= {f"published_{name}": 0.01 * published[name] for name in ("accuracy", "precision")}
+        line |= {f"published_{name}_error_deg": published[f"{name}_mean"] for name in ("rotation", "shift")}
         lines.append(line)
-        e.compare_line("6.3 and 6.4", "", f"f = {f}, noise: {kind}", known, measured)
+        e.compare_line("6.3 and 6.4", "", f"f = {f}, noise: {kind}", published, measured)
     e.write("tables_6_3_and_6_4.csv", lines)
     _draw_reconstruction(e)
 
@@ -199,11 +199,11 @@ def compute_crowd(context: Context, part: Part) -> Results:
         begin = time.perf_counter()
         result = track.update(frame)
         times.append(1e3 * (time.perf_counter() - begin))
-        known = inside & ((before[0] & before[1]) | (np.arange(len(places)) >= total))
+        is_counted = inside & ((before[0] & before[1]) | (np.arange(len(places)) >= total))
         before = (inside, before[0])
         if t >= 4:
-            is_star = (np.arange(len(places)) < total)[known]
-            counts += Confusion.of(result.true_now[known[inside]], is_star).counts
+            is_star = (np.arange(len(places)) < total)[is_counted]
+            counts += Confusion.of(result.true_now[is_counted[inside]], is_star).counts
     return {"counts": counts, "ms": np.array(times[1:])}
 
 

@@ -77,17 +77,17 @@ def _precision(e: Evaluation, percents: list[float]) -> None:
     """Write and draw figures 6.4 and 6.5."""
     shades = dict(zip(percents, colours(len(percents)), strict=True))
     for number, quantity, symbol in ((4, "f", "ε_f"), (5, "theta", "ε_θ")):
-        found = {
+        by_curve = {
             (percent, grid, kind): precision(errors, 1.0, f"p = {percent:g} %", color=shades[percent])
             for percent, grid, kind in itertools.product(percents, (ON, OFF), _KINDS)
             if (errors := e.results[f"p{percent:g}-{grid}"].get(f"{quantity}_{kind}")) is not None
         }
-        columns = {f"p{p:g}_{grid}_{kind}_percent": curve.y for (p, grid, kind), curve in found.items()}
-        e.write(f"figure_6_{number}.csv", {"threshold_deg": next(iter(found.values())).x} | columns)
+        columns = {f"p{p:g}_{grid}_{kind}_percent": curve.y for (p, grid, kind), curve in by_curve.items()}
+        e.write(f"figure_6_{number}.csv", {"threshold_deg": next(iter(by_curve.values())).x} | columns)
         curves = (
-            (f"{word}, {GRID_LABELS[grid]}", found[percent, grid, kind])
+            (f"{word}, {GRID_LABELS[grid]}", by_curve[percent, grid, kind])
             for (kind, word), grid, percent in itertools.product(_KINDS.items(), (ON, OFF), percents)
-            if (percent, grid, kind) in found
+            if (percent, grid, kind) in by_curve
         )
         look = {"columns": 4, "width": 16.0, "height": 9.9, "sharey": True, "legend": "outside right upper"}
         e.draw(f"figure_6_{number}.png", curves, axes=precision_axes(symbol), **look)
@@ -112,11 +112,11 @@ def _compare_best(e: Evaluation, on: Results, off: Results) -> None:
     for (name, key), limit in itertools.product(
         (("sub-cell", "fine"), ("stars compared", "stars")), (0.3, 0.1)
     ):
-        found = shares(off, limit, ours=key)
+        percent = shares(off, limit, ours=key)
         e.claim(
             f"{name} (ours), {elsewhere}: share with ε_f ≤ {limit:g}°, against LSI on the same frames",
-            ours=f"{found['ours']:.2f} %",
-            matches=[found["ours"] >= found["printed"]],
+            ours=f"{percent['ours']:.2f} %",
+            matches=[percent["ours"] >= percent["printed"]],
             target="≥ LSI as printed on the same frames",
             kind="ours",
         )

@@ -136,14 +136,14 @@ def _rate_figures(e: Evaluation) -> None:
             "rate_percent",
             lambda line: f"{_METHODS[line['method']]}, {GRID_LABELS[line['grid']]}",
         )
-        known = [
+        published = [
             (level, e.published(_quantity(case, level, ON, limit)))
             for case, level, _, limit in _CASES
             if case == kind and limit == IDENTIFIED_DEG
         ]
-        if known:
+        if published:
             mark = {"ms": 8, "color": "red"}
-            levels, rates = zip(*known, strict=True)
+            levels, rates = zip(*published, strict=True)
             curves.append(Curve(levels, rates, "x", "published (on the grid)", mark))
         words = f"identification rate (ε_f ≤ {IDENTIFIED_DEG}°) / %"
         axes = {"xlabel": label, "ylabel": words, "xticks": range(4)}

@@ -122,11 +122,11 @@ def solve_frames(
         ]
         if compares:
             estimates.append(compared.solve(features, positions))
-        found = [(each.right_ascension_deg, each.declination_deg, each.theta_rad) for each in estimates]
+        places = [(each.right_ascension_deg, each.declination_deg, each.theta_rad) for each in estimates]
         if with_angle:
             cell, _ = lsi.nearest(solution.observation, theta_rad=features.theta_rad)
-            found.append((*lsi.database.grid.centre(cell), lsi.database.exact_features(cell).theta_rad))
-        for j, (ra, dec, theta) in enumerate(found):
+            places.append((*lsi.database.grid.centre(cell), lsi.database.exact_features(cell).theta_rad))
+        for j, (ra, dec, theta) in enumerate(places):
             answers[j, i] = ra, dec
             angles[j, i] = rotation_error(math.degrees(features.theta_rad - theta), roll_deg)
         psi[:, i] = solution.mse.error_psi, other.mse.error_psi, better.residual

@@ -132,12 +132,12 @@ def evaluate(e: Evaluation) -> None:
             lost = 100.0 * float(np.mean(np.isnan(one)))
             lines.append({"case": part.key, "method": name, **within, "no_answer": lost})
         label = _LABELS.get(part.key, "one star missing, put back from the frame before")
-        seen, regained = (share(one, 1.0) for one in errors)
+        unfilled, regained = (share(one, 1.0) for one in errors)
         e.claim(
             f"{label}, off the grid: share with ε_f ≤ 1°",
             ours=f"{regained:.2f} %",
-            matches=[regained > seen or (part.key == "none" and regained >= seen)],
-            target=f"more than the features as seen, {seen:.2f} %",
+            matches=[regained > unfilled or (part.key == "none" and regained >= unfilled)],
+            target=f"more than the features as seen, {unfilled:.2f} %",
             remark=f"{names[1].capitalize()}: {share(errors[1], 0.3):.1f} % within 0.3°, {lost:.1f} % without "
             f"an answer, {100.0 * np.mean(errors[1] > 1.0):.1f} % wrong by more than 1°.",
             kind="ours",

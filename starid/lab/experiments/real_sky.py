@@ -66,12 +66,12 @@ def evaluate(e: Evaluation) -> None:
     curves: list[tuple[str, Curve]] = []
     for part in e.parts:
         kappa, overlap = part["kappa"], part["overlap"]
-        found = [_figures(errors) for errors in e[part]["errors"]]
-        for sigma, figures in zip(sigmas, found, strict=True):
+        rows = [_figures(errors) for errors in e[part]["errors"]]
+        for sigma, figures in zip(sigmas, rows, strict=True):
             lines.append({"kappa": kappa, "overlap": overlap, "sigma_mag": sigma, **figures})
             quantity = f"boresight within 0.3°, κ = {kappa:g}, p = {100.0 * overlap:g} %, σ = {sigma:g} mag"
             e.compare(quantity, ours=figures["within_0_3"], unit="%", digits=1)
-        y = np.array([figures["within_0_3"] for figures in found])
+        y = np.array([figures["within_0_3"] for figures in rows])
         curves.append((f"p = {100.0 * overlap:g} %", Curve(np.array(sigmas), y, "o-", f"κ = {kappa:g}")))
     e.write("real_sky.csv", lines)
     axes = {"xlabel": "noise of the magnitudes, mag", "ylabel": "frames within 0.3°, %", "ylim": (0.0, 100.0)}

@@ -21,13 +21,13 @@ def experiments() -> dict[str, Experiment]:
     functions: `compute`, `evaluate` and, instead of the trials in the entry, `parts`. The quick run has the
     parameters of the full one but for those in `quick`; without that table there is none.
     """
-    found = {}
+    experiments_by_name = {}
     for name, entry in tomllib.loads(_FILE.read_text(encoding="utf-8")).items():
         module_name, _, end = entry.pop("module").partition(":")
         functions = vars(importlib.import_module(f"starid.lab.experiments.{module_name}"))
         compute, evaluate = (functions[f"{word}_{end}" if end else word] for word in ("compute", "evaluate"))
         full, quick = entry.pop("full"), entry.pop("quick", None)
-        found[name] = Experiment(
+        experiments_by_name[name] = Experiment(
             name,
             parts=functions.get("parts", parts_of),
             compute=compute,
@@ -36,7 +36,7 @@ def experiments() -> dict[str, Experiment]:
             quick=None if quick is None else full | quick,
             **entry,
         )
-    return found
+    return experiments_by_name
 
 
 def select(names: Sequence[str], *, quick: bool) -> list[Experiment]:
@@ -47,13 +47,13 @@ def select(names: Sequence[str], *, quick: bool) -> list[Experiment]:
     ReproduceError
         A name is unknown, or has no quick form although the quick run is requested.
     """
-    known = experiments()
+    by_name = experiments()
     if not names:
-        return [experiment for experiment in known.values() if not quick or experiment.quick is not None]
+        return [experiment for experiment in by_name.values() if not quick or experiment.quick is not None]
     for name in names:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
+        if name not in by_name:
+            near = difflib.get_close_matches(name, by_name, n=1)
             hint = f"did you mean {near[0]}?" if near else "`starid reproduce --list` lists them all"
             raise ReproduceError(f"reproduce: there is no experiment {name}; {hint}")
-        known[name].parameters(quick=quick)
-    return [known[name] for name in dict.fromkeys(names)]
+        by_name[name].parameters(quick=quick)
+    return [by_name[name] for name in dict.fromkeys(names)]

@@ -66,26 +66,25 @@ def _row_table(rows: Iterable[tuple[str, Row]]) -> list[str]:
 
 def counts(results: Sequence[FinishedExperiment]) -> dict[str, dict[str, int]]:
     """For each class, how many numbers agree and how many there are."""
-    found = {kind: {"met": 0, "of": 0} for kind in CLASSES}
+    by_class = {kind: {"met": 0, "of": 0} for kind in CLASSES}
     for kind, row in ((class_of(name, row), row) for name, row in _named_rows(results) if row.kind):
         weak, weak_met = (row.weak, row.weak_met) if kind == "agrees" else (0, 0)
         for each, met, of in ((kind, row.met - weak_met, row.of - weak), ("weak", weak_met, weak)):
-            found[each]["met"] += met
-            found[each]["of"] += of
-    return found
+            by_class[each]["met"] += met
+            by_class[each]["of"] += of
+    return by_class
 
 
 def _named_rows(results: Iterable[FinishedExperiment]) -> list[tuple[str, Row]]:
-    """All rows with the names of their experiments."""
     return [(result.experiment.name, row) for result in results for row in result.outcome.rows]
 
 
 def _choices(results: Iterable[FinishedExperiment]) -> list[str]:
-    found = numbers_by_choice(_named_rows(results))
+    by_choice = numbers_by_choice(_named_rows(results))
     return [
         "## Free choices",
         "",
-        f"The column *as the author ran it* rests on {len(found)} choices that the text of the thesis does not make. A number",
+        f"The column *as the author ran it* rests on {len(by_choice)} choices that the text of the thesis does not make. A number",
         "may depend on several.",
         "",
         *_table(
@@ -93,7 +92,7 @@ def _choices(results: Iterable[FinishedExperiment]) -> list[str]:
             3,
             (
                 (name, *(f"{each[key]}" for key in ("numbers", "agree", "fitted")))
-                for name, each in found.items()
+                for name, each in by_choice.items()
             ),
         ),
         "",

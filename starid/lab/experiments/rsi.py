@@ -97,46 +97,46 @@ def _label(values: Mapping[str, Any]) -> str:
 
 def evaluate(e: Evaluation) -> None:
     """The tables beside ours, the figures, and the mean errors with memory against the published ones."""
-    found = {part.key: statistics(e[part]["numbers"], SETTLING) for part in e.parts}
+    figures = {part.key: statistics(e[part]["numbers"], SETTLING) for part in e.parts}
     lines = []
     for part in e.parts:
         v, known = part.values, _published(part.values)
-        cells = region_cells(found[part.key]["side_mean"], _FIELD_DEG, v["overlap"])
-        found[part.key]["region_kB"] = 1e-3 * _BYTES_PER_CELL * cells
+        cells = region_cells(figures[part.key]["side_mean"], _FIELD_DEG, v["overlap"])
+        figures[part.key]["region_kB"] = 1e-3 * _BYTES_PER_CELL * cells
         published = {f"published_{name}": known.get(name, "") for name in _PUBLISHED}
         method = method_of(v["tau"], v["memory"], v["side"])
-        lines.append({**v, "method": method, **found[part.key], **published})
+        lines.append({**v, "method": method, **figures[part.key], **published})
     e.write("tables_6_7_6_8_6_9_h_1_h_2.csv", lines)
     diagonal = [part for part in e.parts if part["false_stars"] == part["factor"]]
-    _write_sides(e, diagonal, found)
+    _write_sides(e, diagonal, figures)
     if not e.context.quick:
         _draw(e, diagonal)
-    _compare(e, diagonal, found)
+    _compare(e, diagonal, figures)
 
 
-def _write_sides(e: Evaluation, parts: Sequence[Part], found: Mapping[str, dict[str, float]]) -> None:
+def _write_sides(e: Evaluation, parts: Sequence[Part], figures: Mapping[str, dict[str, float]]) -> None:
     """Write Γ by eq. 6.5 as printed, with the square root, and in table 6.8, for the first RSI method."""
     settings = RsiSettings()
     tau = min(t for t, *_ in e.parameters["methods"] if t != LSI_ONLY)
     lines = []
     for part in parts:
-        v, known, s = part.values, _published(part.values), found[part.key]
-        if v["overlap"] != e.parameters["overlaps"][0] or v["tau"] != tau or not known:
+        v, published, s = part.values, _published(part.values), figures[part.key]
+        if v["overlap"] != e.parameters["overlaps"][0] or v["tau"] != tau or not published:
             continue
         distances = s["mean_distance_deg"], s["sigma_distance_deg"]
         line = {"factor": v["factor"], "scale": v["scale"]}
         line |= dict(zip(("mu_d_deg", "sigma_d_deg"), distances, strict=True))
         line["as_printed_deg"] = side_as_printed(*distances, settings.gamma_min_deg)
         line["square_root_deg"] = region_side(*distances, settings)
-        lines.append(line | {"published_deg": known["side_mean"]})
+        lines.append(line | {"published_deg": published["side_mean"]})
     if lines:
         e.write("equation_6_5.csv", lines)
 
 
-def _compare(e: Evaluation, diagonal: Sequence[Part], found: Mapping[str, dict[str, float]]) -> None:
+def _compare(e: Evaluation, diagonal: Sequence[Part], figures: Mapping[str, dict[str, float]]) -> None:
     """Compare the mean ε_f of the sets with μ = f, and the worst of all sets."""
     for part in diagonal:
-        v, s = part.values, found[part.key]
+        v, s = part.values, figures[part.key]
         published = RECURSION[v["overlap"], v["factor"], v["tau"]]["error_mean"]
         e.compare(
             f"mean ε_f, {_label(v)}",
@@ -150,7 +150,7 @@ def _compare(e: Evaluation, diagonal: Sequence[Part], found: Mapping[str, dict[s
         )
     for overlap in e.parameters["overlaps"]:
         means = {
-            set_label(v): found[part.key]["error_mean"]
+            set_label(v): figures[part.key]["error_mean"]
             for part in e.parts
             if (v := part.values)["overlap"] == overlap and v["memory"] and v["scale"] != PRINTED
         }

@@ -101,15 +101,15 @@ def _distances(frames: Sequence[SimulatedFrame], results: Sequence[FilterResult]
     """
     from scipy.spatial import cKDTree
 
-    found = np.full((len(results), 4), math.nan)
+    distances = np.full((len(results), 4), math.nan)
     for i, (before, now, result) in enumerate(zip(frames[:-1], frames[1:], results, strict=True)):
         first, second = before.observed.positions, now.observed.positions
         motion = matched_motion(before.observed, now.observed, result.matches, model="affine")
         if motion is None:
             continue
         away, _ = cKDTree(second[result.true_now]).query(motion.apply(first[result.true_before]))
-        found[i] = motion.mean_distance_deg, motion.sigma_distance_deg, away.mean(), away.std(ddof=1)
-    return found
+        distances[i] = motion.mean_distance_deg, motion.sigma_distance_deg, away.mean(), away.std(ddof=1)
+    return distances
 
 
 def _sequences(context: Context, part: Part) -> Results:
@@ -121,14 +121,14 @@ def _sequences(context: Context, part: Part) -> Results:
     frames = list(made)
     cluster = MatlabFilter(PIXEL_DEG, loses_unequal=False) if author else ClusterFilter()
     results = [cluster(before.observed, now.observed) for before, now in itertools.pairwise(frames)]
-    found: Results = {"distances": _distances(frames, results)}
+    results_by_name: Results = {"distances": _distances(frames, results)}
     readings = ("author",) if author else ("printed", "rigid")
     for overlap, reading, tau in itertools.product(context.parameters["overlaps"], readings, _TAUS):
         lsi = context.lost_in_space(overlap, "matlab" if author else "exact")
         recursion = RecursiveIdentification(lsi, _replayed(results), _settings(reading, tau))
         numbers = [measured_step(recursion.step(frame.observed), frame) for frame in frames]
-        found[f"{reading}-p{100 * overlap:g}-t{tau:g}"] = np.array(numbers).T
-    return found
+        results_by_name[f"{reading}-p{100 * overlap:g}-t{tau:g}"] = np.array(numbers).T
+    return results_by_name
 
 
 def _compare_errors(e: Evaluation, overlap: float, m: int, tau: float) -> None:

@@ -19,7 +19,6 @@ from starid.storage.files import write_atomically
 from starid.storage.results import read_results, write_results
 
 OUTCOME_FILE: Final = "outcome.json"
-"""File of the outcome in the folder of an experiment."""
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of the experiment, the number of parts done and the total."""

@@ -53,7 +53,7 @@ def _kappa(context: Context, kappa: float) -> Results:
 def _lambda(context: Context) -> Results:
     lsi = context.lost_in_space(_OVERLAP)
     errors = np.empty((2, len(_SHOWN_LAMBDAS), len(_frames(context))))
-    chosen = [int(np.argmin(np.abs(LAMBDAS - value))) for value in _SHOWN_LAMBDAS]
+    columns = [int(np.argmin(np.abs(LAMBDAS - value))) for value in _SHOWN_LAMBDAS]
     path = np.empty((LAMBDAS.size, 9))
     for i, (ra, dec), features in _observed(context, context.sky()):
         solution = lsi.solve(features)
@@ -61,7 +61,7 @@ def _lambda(context: Context) -> Results:
         centres[:, 0] = ra + (centres[:, 0] - ra + 180.0) % 360.0 - 180.0
         for j, solve in enumerate((matlab_path, lasso_path)):
             solve(solution.dictionary, solution.observation, LAMBDAS, path)
-            for k, at in enumerate(chosen):
+            for k, at in enumerate(columns):
                 total = path[at].sum()
                 weights = path[at] / total if abs(total) > 1e-3 else np.eye(9)[4]
                 errors[j, k, i] = math.hypot(*(weights @ centres - (ra, dec)))
@@ -84,11 +84,11 @@ def _gamma(context: Context, side: float) -> Results:
 
 def _validity(context: Context) -> Results:
     lsi = context.lost_in_space(_OVERLAP, "matlab")
-    found = np.empty((2, len(_frames(context))))
+    numbers = np.empty((2, len(_frames(context))))
     for i, place, features in _observed(context, context.sky()):
         estimate = lsi.solve(features).mse
-        found[:, i] = error_of(estimate, *place), estimate.error_psi
-    return {"errors": found[0], "psi": found[1]}
+        numbers[:, i] = error_of(estimate, *place), estimate.error_psi
+    return {"errors": numbers[0], "psi": numbers[1]}
 
 
 def _filter(context: Context, epsilon: float, part: float) -> Results:

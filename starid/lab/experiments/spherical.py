@@ -45,11 +45,11 @@ def points(
     stars = catalog.brighter_than(_LIMIT + 0.8)
     xy, inside = camera.project(attitude.to_sensor(stars.vectors))
     magnitude = stars.v + rng.normal(0.0, 1.0, len(stars)) * noise["magnitude"]
-    seen = inside & (magnitude <= _LIMIT)
-    xy = xy[seen] + rng.normal(0.0, 1.0, (int(seen.sum()), 2)) * noise["position"]
+    is_detected = inside & (magnitude <= _LIMIT)
+    xy = xy[is_detected] + rng.normal(0.0, 1.0, (int(is_detected.sum()), 2)) * noise["position"]
     false = int(noise["false"])
     xy = np.concatenate([xy, rng.uniform(0.0, camera.width - 1.0, (false, 2))])
-    magnitude = np.concatenate([magnitude[seen], rng.uniform(2.0, _LIMIT, false)])
+    magnitude = np.concatenate([magnitude[is_detected], rng.uniform(2.0, _LIMIT, false)])
     order = rng.permutation(magnitude.size)
     return xy[order], 10.0 ** (-0.4 * (magnitude[order] - _ZERO_POINT))
 
@@ -100,12 +100,12 @@ def evaluate(e: Evaluation) -> None:
         name, label = part["algorithm"].upper(), _label(noise)
         head = {"algorithm": part["algorithm"], "noise": label}
         lines += [head | dict(zip(_COLUMNS, frame, strict=True)) for frame in numbers]
-        found = dict(zip(_COLUMNS, numbers.T, strict=True))
-        valid = found["valid"] > 0.0
-        errors = found["cross_arcsec"][valid]
+        columns = dict(zip(_COLUMNS, numbers.T, strict=True))
+        valid = columns["valid"] > 0.0
+        errors = columns["cross_arcsec"][valid]
         for limit in (0.3, 1.0, 2.0) if name == "LSI" else ():
             quantity = f"one neighbour and LASSO, boresight within {limit:g}°, {label}"
-            e.compare(quantity, ours=share(found["coarse_deg"], limit), unit="%", digits=1)
+            e.compare(quantity, ours=share(columns["coarse_deg"], limit), unit="%", digits=1)
         bound = "≥ 98" if noise["false"] <= 5 else ""
         right = 100.0 * float(valid.mean())
         e.compare(f"{name} verified and valid, {label}", ours=right, unit="%", digits=1, check=bound)
@@ -114,8 +114,8 @@ def evaluate(e: Evaluation) -> None:
         if valid.any():
             middle = float(np.median(errors))
             e.compare(f"{name} median cross-boresight error, {label}", ours=middle, unit="″")
-        e.compare(f"{name} median time a frame, {label}", ours=float(np.median(found["ms"])), unit="ms")
+        e.compare(f"{name} median time a frame, {label}", ours=float(np.median(columns["ms"])), unit="ms")
         if name == "RSI":
-            inside = 100.0 * float(found["tracking"][1:].mean())
+            inside = 100.0 * float(columns["tracking"][1:].mean())
             e.compare(f"RSI answered from the region, {label}", ours=inside, unit="%", digits=1)
     e.write("frames.csv", lines)

@@ -151,7 +151,7 @@ def numbers_by_choice(rows: Iterable[tuple[str, Row]]) -> dict[str, dict[str, in
 
     `rows` come with the names of their experiments.
     """
-    found: dict[str, dict[str, int]] = {
+    by_choice: dict[str, dict[str, int]] = {
         each.choice: {"numbers": 0, "agree": 0, "fitted": 0} for each in CHOICES
     }
     for experiment, row in rows:
@@ -160,7 +160,7 @@ def numbers_by_choice(rows: Iterable[tuple[str, Row]]) -> dict[str, dict[str, in
             if each.bears_on(experiment, row):
                 bearing.setdefault(each.choice, set()).add(each.role)
         for choice, roles in bearing.items():
-            found[choice]["numbers"] += row.of
-            found[choice]["agree"] += row.met
-            found[choice]["fitted"] += row.of if "fitted" in roles else 0
-    return found
+            by_choice[choice]["numbers"] += row.of
+            by_choice[choice]["agree"] += row.met
+            by_choice[choice]["fitted"] += row.of if "fitted" in roles else 0
+    return by_choice

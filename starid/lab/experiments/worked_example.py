@@ -165,11 +165,11 @@ def evaluate(e: Evaluation) -> None:
     e.compare(_THETAS, author=result["author_thetas"], printed=result["thetas"])
     for kind in _LABELS:
         _compare_estimate(e, result, kind)
-    known = [e.published(f"dictionary vector {cell}") for cell in _CELLS]
+    published = [e.published(f"dictionary vector {cell}") for cell in _CELLS]
     table: dict[str, Any] = {"cell": result["cells"] + 1}
     for head, features, thetas in (
         ("", vectors, result["thetas"]),
-        ("published_", known, e.published(_THETAS)),
+        ("published_", published, e.published(_THETAS)),
     ):
         names = (f"{head}{name}" for name in _COLUMNS)
         table |= dict(zip(names, zip(*features, strict=True), strict=True)) | {f"{head}theta_deg": thetas}

@@ -87,13 +87,13 @@ class Tally:
         if reply.matrix is None:
             return
         self.valid += 1
-        found = Attitude.from_matrix(_orthonormal(reply.matrix))
-        if floor is None or _is_off(found, scene.attitude):
+        answer = Attitude.from_matrix(_orthonormal(reply.matrix))
+        if floor is None or _is_off(answer, scene.attitude):
             self.wrong += 1
-            if floor is None or _is_off(found, floor):
+            if floor is None or _is_off(answer, floor):
                 return
             self.ill_conditioned += 1
-        error = found.error_to(scene.attitude)
+        error = answer.error_to(scene.attitude)
         bound = floor.error_to(scene.attitude)
         self.boresight.append(error.cross_boresight_arcsec)
         self.roll.append(error.roll_arcsec)
@@ -263,7 +263,6 @@ class _Field:
 
 
 def _run_row(row: str, frames: int, seed: int, field_of: _Field, budget_s: float) -> list[Tally]:
-    """All solvers on the scenes of one row."""
     settings, maker, solvers = ROWS[row], field_of.maker, field_of.solvers
     tallies = {name: Tally(row, name) for name in solvers}
     spent = dict.fromkeys(solvers, 0.0)

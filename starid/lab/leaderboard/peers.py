@@ -310,13 +310,13 @@ def _ruststartracker(camera: Camera, stars: StarCatalog) -> Solver:
     from scipy.spatial.transform import Rotation
 
     (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
-    wanted = round(RUST_PER_FIELD * 4.0 * math.pi / field_solid_angle(camera))
+    on_sky = round(RUST_PER_FIELD * 4.0 * math.pi / field_solid_angle(camera))
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=np.float32)
     tracker: Any = ruststartracker.StarTracker(
         stars.vectors.astype(np.float32),
         stars.v.astype(np.float32),
         ruststartracker.CameraParameters(matrix, (camera.width, camera.height), None),
-        max_lookup_magnitude=float(stars.v[min(wanted, len(stars)) - 1]),
+        max_lookup_magnitude=float(stars.v[min(on_sky, len(stars)) - 1]),
         inter_star_angle_tolerance=RUST_TOLERANCE_PX * camera.pixel_scale_rad,
         n_minimum_matches=RUST_MATCHES,
     )

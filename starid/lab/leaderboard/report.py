@@ -71,7 +71,7 @@ def _wrong(entry: Mapping[str, Any]) -> float:
     return 100.0 * float(entry["wrong"]) / max(int(entry["frames"]), 1)
 
 
-def _line(entry: Mapping[str, Any], asked: int) -> str:
+def _line(entry: Mapping[str, Any], scene_count: int) -> str:
     figures = (
         _text(entry["boresight_median_arcsec"], 1),
         _text(entry["floor_ratio"], 2),
@@ -79,7 +79,9 @@ def _line(entry: Mapping[str, Any], asked: int) -> str:
         _text(entry["p99_ms"], 1),
         _text(entry["cpu_median_ms"], 2),
     )
-    scenes = f"{entry['frames']}" if entry["frames"] == asked else f"**{entry['frames']}** of {asked}"
+    scenes = (
+        f"{entry['frames']}" if entry["frames"] == scene_count else f"**{entry['frames']}** of {scene_count}"
+    )
     return f"| {entry['solver']} | {scenes} | {right(entry):.1f} | {entry['wrong']} ({entry['ill_conditioned']}) | {' | '.join(figures)} |"
 
 

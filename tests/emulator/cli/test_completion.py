@@ -58,6 +58,7 @@ def test_what_ships_is_listed_with_a_description(words: list[str], kinds: list[s
     assert [name for name, _ in rows] == [name for kind in kinds for name in bundled(kind)]
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("words", "kind"),
     [

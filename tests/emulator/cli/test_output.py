@@ -90,6 +90,7 @@ def test_missing_folders_are_made_and_a_file_in_their_place_is_rejected(
     assert "is a folder" in refusal(*arguments.split(), str(path.parent))
 
 
+@pytest.mark.process
 def test_an_export_to_the_standard_output_is_in_utf_8_whatever_its_encoding_is() -> None:
     plain = starhil("icd", "export", "markdown", PYTHONIOENCODING="ascii").stdout
     assert starhil("icd", "export", "markdown", "-o", "/proc/self/fd/1").stdout == plain
@@ -97,6 +98,7 @@ def test_an_export_to_the_standard_output_is_in_utf_8_whatever_its_encoding_is()
     assert not plain.isascii()
 
 
+@pytest.mark.process
 def test_an_image_on_the_standard_output_has_its_report_on_the_standard_error() -> None:
     done = starhil(
         "render", "--ra", "83.8", "--dec", "-1.2", "--size", "64", "-o", "/proc/self/fd/1", "--json"

@@ -5,21 +5,24 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.bench import group as bench
-from starhil.emulator.cli.conformance import links_of
+from starhil.emulator.cli.conformance import CaseOptions
+from starhil.emulator.cli.options import BenchOptions
 from starhil.emulator.cli.unit import group
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.run import Run
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess
+from starhil.hil_tests.rig.rig import LinkOptions
+from starhil.hil_tests.session import SessionRequest, run_session
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.files.bundled import bundled_units, find
-from starhil.protocol.unit import load_unit
 
 
 def unit(*words: str):
@@ -143,17 +146,33 @@ def test_a_unit_without_the_links_that_are_asked_for_starts_nothing(monkeypatch,
 
 
 @pytest.mark.parametrize(
-    ("name", "node", "links"),
+    ("name", "options", "links"),
     [
-        ("cubestar", None, ("auto", "auto", None)),
-        ("cubestar", 44, ("auto", "auto", 44)),
-        ("sagitta", None, ("auto", None, None)),
-        ("cubestar-gen2", None, ("auto", "auto", None)),
-        ("oresat", None, (None, "auto", 0x2C)),
+        ("cubestar", {}, ("auto", "auto", None)),
+        ("cubestar", {"canopen": 44}, ("auto", "auto", 44)),
+        ("cubestar", {"serial": "off"}, (None, "auto", None)),
+        ("cubestar", {"can": "off"}, ("auto", None, None)),
+        ("cubestar", {"can": "auto"}, (None, "auto", None)),
+        ("sagitta", {}, ("auto", None, None)),
+        ("cubestar-gen2", {}, ("auto", "auto", None)),
+        ("oresat", {}, (None, "auto", 0x2C)),
+        ("oresat", {"can": "auto"}, (None, "auto", 0x2C)),
     ],
 )
-def test_a_conformance_run_takes_the_links_that_the_unit_has(name, node, links):
-    assert links_of(load_unit(name), node) == links
+def test_a_conformance_run_takes_the_links_that_the_unit_has(name, options, links):
+    node = {"canopen": options.pop("canopen")} if "canopen" in options else {}
+    bench = BenchOptions(unit=name, start=True, **options)
+    request = CaseOptions(**node).request(bench, (), list_only=False)
+    assert (request.serial, request.can, request.canopen_node) == links
+
+
+@pytest.mark.parametrize("options", [{"serial": "off"}, {"can": "off"}, {"serial": "off", "can": "off"}])
+def test_no_command_takes_off_for_the_name_of_a_port(options):
+    with pytest.raises(BenchError, match="no link: use --serial DEV"):
+        CaseOptions().request(BenchOptions(**options), (), list_only=False)
+    request = SessionRequest(Path("first_light"), LinkOptions(**options))
+    with pytest.raises(BenchError, match="no link: use --serial DEV"):
+        run_session(request)
 
 
 def test_the_load_of_the_links_is_refused_for_a_unit_without_its_rows():

@@ -12,7 +12,8 @@ from starhil.emulator.control import channel, scenario
 from starhil.emulator.control.channel import MAX_LINE
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
-from starhil.emulator.sensor.sky.objects import MAX_ROWS, SkyObjects
+from starhil.emulator.sensor.sky.objects import MAX_ROWS
+from starhil.emulator.sensor.sky.tables import OPTICAL_FAULT
 from starhil.emulator.truth.config import MAX_SEGMENTS
 from starhil.emulator.truth.feed import MAX_LINES, LiveFeed, _Datagrams
 from starhil.emulator.truth.live import LiveTruth
@@ -85,11 +86,11 @@ def test_a_scenario_and_a_sky_have_limits() -> None:
     planet = {"ra_deg": 1.0, "dec_deg": 2.0, "magnitude": 3.0}
     for rows in ({"planets": [planet]}, {"obstructions": [{}]}):
         ((name, row),) = rows.items()
-        SkyObjects.from_dict({name: row * MAX_ROWS})
-        with pytest.raises(EmulatorError, match=f"sky {name}: must have at most {MAX_ROWS} items, not 201"):
-            SkyObjects.from_dict({name: row * (MAX_ROWS + 1)})
-    with pytest.raises(EmulatorError, match="polygon_px: must have at most"):
-        SkyObjects.from_dict({"obstructions": [{"polygon_px": [[0.0, 0.0]] * (MAX_ROWS + 1)}]})
+        OPTICAL_FAULT.model_validate({name: row * MAX_ROWS})
+        with pytest.raises(ValueError, match=f"{name}\n.* at most {MAX_ROWS} items .* not 201"):
+            OPTICAL_FAULT.model_validate({name: row * (MAX_ROWS + 1)})
+    with pytest.raises(ValueError, match=f"polygon_px\n.* at most {MAX_ROWS} items"):
+        OPTICAL_FAULT.model_validate({"obstructions": [{"polygon_px": [[0.0, 0.0]] * (MAX_ROWS + 1)}]})
 
 
 def test_a_datagram_is_read_up_to_a_number_of_lines_and_a_length() -> None:
@@ -107,11 +108,17 @@ def test_a_datagram_is_read_up_to_a_number_of_lines_and_a_length() -> None:
 
 def test_the_rest_of_a_file_with_very_many_errors_is_not_checked(tmp_path: Any) -> None:
     profile = tmp_path / "profile.toml"
-    profile.write_text("[sensor]\n" + "".join(f"gian{number} = 1\n" for number in range(5000)))
+    keys = "".join(f"gian{number} = 1\n" for number in range(5000))
+    profile.write_text(f"[parameters]\n{keys}")
     with pytest.raises(EmulatorError) as caught:
         load_profile(str(profile))
     assert len(caught.value.args) == MAX_PROBLEMS
     assert "4981 more keys are not checked; correct these first" in str(caught.value)
+    profile.write_text(f"[sensor]\n{keys}[sky]\n{keys}")
+    with pytest.raises(EmulatorError) as caught:
+        load_profile(str(profile))
+    assert len(caught.value.problems) == MAX_PROBLEMS + 1
+    assert caught.value.problems[-1] == "and 9980 more"
     session = tmp_path / "session.toml"
     session.write_text("[[step]]\ntelemetri = 'x'\n" * 5000)
     with pytest.raises(ScriptError, match="4980 more steps are not checked; correct these first") as wrong:

@@ -133,11 +133,11 @@ def test_the_mounting_angles_turn_right_ascension_declination_and_roll(make_benc
     bench.command("set_parameter", parameter=20, value=10.0)
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
-    shot = bench.device.snapshot()
+    snapshot = bench.device.snapshot()
     mounted = Attitude(
         (rotation_of(ATTITUDE).inv() * Rotation.from_euler("x", 10.0, degrees=True)).inv().as_quat()
     )
-    measured = [getter_of(f"attitude.{name}")(shot) for name in ("ra", "dec", "roll")]
+    measured = [getter_of(f"attitude.{name}")(snapshot) for name in ("ra", "dec", "roll")]
     assert measured == pytest.approx([mounted.ra_deg, mounted.dec_deg, mounted.roll_deg], abs=NARROW)
 
 

@@ -164,9 +164,9 @@ def test_exposures_that_the_machine_has_no_time_for_are_skipped_and_tracking_con
 def test_the_age_of_a_frame_counts_from_the_middle_of_its_exposure(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
-    shot = bench.device.snapshot()
-    age_s = (bench.clock.now_ns() - shot.frame.mid_ns) / 1e9
-    assert getter_of("frame.age")(shot) == age_s
+    snapshot = bench.device.snapshot()
+    age_s = (bench.clock.now_ns() - snapshot.frame.mid_ns) / 1e9
+    assert getter_of("frame.age")(snapshot) == age_s
     assert 0.0 < age_s < 2.5
 
 

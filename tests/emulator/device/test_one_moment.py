@@ -131,7 +131,7 @@ def reachable(value: object, path: str, *, table: bool = False) -> Iterator[tupl
         yield from reachable(item, name, table=table)
 
 
-def values_of(shot: Snapshot, icd: InterfaceDefinition) -> dict[str, object]:
+def values_of(snapshot: Snapshot, icd: InterfaceDefinition) -> dict[str, object]:
     """Return all quantities of a snapshot."""
     values = {}
     names = [f"parameter.{name}" for name in icd.device_parameters] + ["health.board"]
@@ -140,7 +140,7 @@ def values_of(shot: Snapshot, icd: InterfaceDefinition) -> dict[str, object]:
         names += [name] if count is None else [name.replace("[n]", f"[{n}]") for n in range(1, count + 1)]
     for name in names:
         try:
-            values[name] = getter_of(name)(shot)
+            values[name] = getter_of(name)(snapshot)
         except Refused as refused:
             values[name] = refused.code
     return values
@@ -153,11 +153,11 @@ def test_no_quantity_can_reach_a_device_or_a_clock(passing, unit):
     bench.step(1.3)
     bench.device.files.rewind()
     bench.step(0.1)
-    shot = bench.device.snapshot()
-    values_of(shot, bench.icd)  # what is computed at first use is kept in the snapshot
-    assert shot.frame.valid
-    assert shot.file is not None
-    assert list(reachable(shot, "snapshot")) == []
+    snapshot = bench.device.snapshot()
+    values_of(snapshot, bench.icd)  # what is computed at first use is kept in the snapshot
+    assert snapshot.frame.valid
+    assert snapshot.file is not None
+    assert list(reachable(snapshot, "snapshot")) == []
 
 
 PYTHON_TYPES = {"bool": bool, "int": int, "float": float, "text": str, "bytes": bytes}
@@ -180,9 +180,9 @@ def test_values_have_the_types_that_the_model_declares(passing):
 
 def test_a_door_to_the_device_would_be_found(passing):
     bench = passing()
-    shot = bench.device.snapshot()
+    snapshot = bench.device.snapshot()
     for leak in (bench.device, bench.clock, bench.clock.now_ns, lambda: 0, [1], {"a": 1}, np.zeros(3)):
-        assert [path for path, _ in reachable(replace(shot, accepted=(leak,)), "snapshot")] == [
+        assert [path for path, _ in reachable(replace(snapshot, accepted=(leak,)), "snapshot")] == [
             "snapshot.accepted[0]"
         ]
 

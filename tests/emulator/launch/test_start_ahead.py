@@ -28,6 +28,7 @@ def python(program):
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_before_the_event_loop_ends_a_run_as_a_later_one_does(number):
     program = AHEAD.replace("raise KeyboardInterrupt", f"import signal; signal.raise_signal({int(number)})")
@@ -36,6 +37,7 @@ def test_a_signal_before_the_event_loop_ends_a_run_as_a_later_one_does(number):
     assert ended.stdout.startswith("worker")
 
 
+@pytest.mark.process
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [(["run", "demo"], "worker False False"), (["run", "--help"], "Usage"), ([], "Usage")],

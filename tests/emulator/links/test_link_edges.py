@@ -5,6 +5,7 @@ import random
 
 import pytest
 
+from starhil.emulator.launch.simulated_loop import SimulatedLoop
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import JUNK_BYTES, SerialDamage, SerialLink
@@ -177,7 +178,9 @@ def test_after_a_gap_without_frames_the_next_one_is_sent_at_once(bench):
             await asyncio.sleep(0.02)
         await link.close()
 
-    asyncio.run(scenario())
+    loop = SimulatedLoop()
+    loop.run_until_complete(scenario())
+    loop.close()
 
 
 def test_stored_parameters_that_cannot_be_read_are_a_fault_of_the_store(make_bench, caplog):

@@ -9,6 +9,7 @@ from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.errors import EmulatorError
 from tests.emulator.runs import command
+from tests.protocol.transports.pairs import turns, until
 
 LONG_STEP_S = 86_400.0
 REQUEST = bytes.fromhex("1F7FE61FFF")
@@ -17,7 +18,7 @@ REQUEST = bytes.fromhex("1F7FE61FFF")
 def test_a_step_ends_with_the_run(run):
     async def scenario(emulation, _line):
         stepping = asyncio.create_task(emulation.stepper.step(LONG_STEP_S))
-        await asyncio.sleep(0.05)
+        await until(lambda: emulation.device.cycle.published > 0)
         await run.launched.close()
         await asyncio.wait({stepping}, timeout=1.0)
         assert stepping.cancelled()
@@ -58,15 +59,15 @@ def test_no_events_run_while_the_heads_are_closed(run):
 
     async def scenario(emulation, _line):
         stepping = asyncio.create_task(emulation.stepper.step(LONG_STEP_S))
-        await asyncio.sleep(0.05)
         frames = []
         first, second = emulation.run.heads
+        await until(lambda: first.device.cycle.published > 0)
         close = second.imager.close
 
         async def slow_close():
             await close()
             frames.append(first.device.cycle.published)
-            await asyncio.sleep(0.05)
+            await turns()
             frames.append(first.device.cycle.published)
 
         second.imager.close = slow_close

@@ -13,14 +13,12 @@ FRAMES = 3
 FEWER_STARS = {"limiting_magnitude": 3.0}
 LOST_IN_SPACE = "parameters.start_mode=lost_in_space"
 
-pytestmark = pytest.mark.process
 
-
-def run(scenario, state_dir, *settings, clock="scaled:2"):
+def run(scenario, state_dir, clock="scaled:2", worker="thread"):
     """Run a scenario with a miscalibrated device that keeps its state in a folder."""
     links = ("links.serial.port=off", "links.can.channel=off")
-    state = (f"run.clock={clock}", f"run.state_dir={state_dir}")
-    profile = load_profile("cubestar", [*links, *state, LOST_IN_SPACE, *settings])
+    state = (f"run.clock={clock}", f"run.state_dir={state_dir}", f"run.worker={worker}")
+    profile = load_profile("cubestar", [*links, *state, LOST_IN_SPACE])
 
     async def whole():
         run = Run([profile])
@@ -45,7 +43,7 @@ async def first_frames(emulation):
         await emulation.stepper.step(FRAMES + 1.0)
     while len(emulation.shots) < FRAMES:
         await asyncio.sleep(0.01)
-    return [shot.result for shot in emulation.shots[:FRAMES]]
+    return [snapshot.result for snapshot in emulation.shots[:FRAMES]]
 
 
 def rows(results):
@@ -65,7 +63,7 @@ def test_it_is_solved_with_the_stored_parameters(tmp_path):
         emulation.device.parameters.set(FEWER_STARS)
         emulation.device.save_parameters()
 
-    run(save, tmp_path)
+    run(save, tmp_path, worker="error_model")
     results = run(first_frames, tmp_path)
     assert not any(result.index_pending for result in results)
     assert len({result.matched for result in results}) == 1
@@ -82,6 +80,7 @@ def test_after_a_reset_it_is_solved_with_the_restored_parameters(tmp_path):
     assert not any(result.index_pending for result in run(reset, tmp_path))
 
 
+@pytest.mark.process
 def test_after_the_end_of_the_pipeline_it_is_solved_with_the_current_parameters(tmp_path):
     async def kill(emulation):
         emulation.imager.worker.process.kill()
@@ -93,4 +92,4 @@ def test_after_the_end_of_the_pipeline_it_is_solved_with_the_current_parameters(
         command(emulation, "set_mode", mode="lost_in_space")
         return await first_frames(emulation)
 
-    assert not any(result.index_pending for result in run(kill, tmp_path))
+    assert not any(result.index_pending for result in run(kill, tmp_path, worker="process"))

@@ -8,6 +8,7 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
 from tests.emulator.runs import CAMERA, FirstHead, command, read
 from tests.emulator.workers import ANSWERING, WORKER
+from tests.protocol.transports.pairs import turns
 
 WITHIN_S = 20.0
 ENDS_AT_ONCE = ""
@@ -88,7 +89,7 @@ def test_a_pipeline_that_does_not_restart_is_abandoned_until_a_reset(run, caplog
         await until(lambda: device.modes.error == "pipeline_ended")
         assert read(emulation, "device_status")["error"] == "pipeline_ended"
         assert "reset the device to try again" in caplog.text
-        await asyncio.sleep(0.3)
+        await turns()
         assert len(started) == 1 + ATTEMPTS
         assert set_mode(emulation, "standby") == "SEQUENCE"
         command(emulation, "reset")

@@ -229,7 +229,7 @@ def test_every_scenario_of_the_product_is_valid(name):
         ("[[at]]\nrun_time_s = 1.0\n", "give fault, truth or clear_faults"),
         (
             "[[at]]\nrun_time_s = 1.0\nfault = { optical = { false_star = 1 } }\n",
-            "unknown key 'false_star'",
+            "at.0.fault.optical.false_star: unknown key",
         ),
         ("[[at]]\nrun_time_s = 1.0\ntruth = { kind = 'live' }\n", "live feed"),
         ("[[at]]\nrun_time_s = -1.0\nclear_faults = true\n", "run_time_s"),

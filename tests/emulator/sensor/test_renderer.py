@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
 from starhil.emulator.sensor.renderer import Renderer, SensorModel, render
+from starhil.emulator.sensor.sky.objects import SkyObjects
 from starid.attitude import Attitude, random_attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
+from starid.imaging.detection import detect
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 CLEAN = SensorModel(bits=16, hot_pixels=0, dead_pixels=0, prnu=0.0, dsnu=0.0, read_noise_e=2.0)
@@ -54,6 +58,25 @@ def test_roll_turns_north_counter_clockwise(renderer: Renderer) -> None:
     centre = np.array(DEFAULT_CAMERA.centre_px)
     upright = place_of(renderer.render(ORION).stars, BETELGEUSE) - centre
     assert place_of(turned, BETELGEUSE) - centre == pytest.approx([upright[1], -upright[0]], abs=1e-6)
+
+
+def test_noise_of_the_stars_displaces_and_changes_them_as_stated(renderer: Renderer) -> None:
+    sky = SkyObjects(star_position_noise_px=2.0, star_magnitude_noise=0.2)
+    plain, noisy = renderer.render(ORION), renderer.render(ORION, objects=sky)
+    assert np.array_equal(plain.stars.xy_px, noisy.stars.xy_px)  # the truth is that of the catalogue
+    seen = [detect(frame.image) for frame in (plain, noisy)]
+    gaps = np.hypot(*(seen[0].xy_px[:, None] - seen[0].xy_px[None]).T)
+    np.fill_diagonal(gaps, np.inf)
+    alone = np.flatnonzero(gaps.min(axis=1) > 40.0)
+    distance = np.hypot(*(seen[0].xy_px[alone, None] - seen[1].xy_px[None]).transpose(2, 0, 1))
+    partner = distance.argmin(axis=1)
+    moved = seen[1].xy_px[partner] - seen[0].xy_px[alone]
+    paired = np.hypot(*moved.T) < 12.0
+    change = -2.5 * np.log10(seen[1].flux[partner] / seen[0].flux[alone])[paired]
+    count = np.count_nonzero(paired)
+    assert count >= 20
+    assert np.std(moved[paired]) == pytest.approx(2.0, rel=4.0 / np.sqrt(4.0 * count))  # four standard errors
+    assert np.std(change) == pytest.approx(0.2, rel=4.0 / np.sqrt(2.0 * count))
 
 
 def test_light_lies_at_the_true_places_with_the_true_amount(renderer: Renderer) -> None:
@@ -236,14 +259,34 @@ def test_other_cameras_render(catalog: StarCatalog) -> None:
     ],
 )
 def test_bad_sensors_are_rejected_in_one_line(field: str, value: object) -> None:
-    with pytest.raises(EmulatorError, match=rf"^sensor\.{field}: must be .*, not ") as caught:
-        SensorModel().with_(**{field: value})
+    given = json.dumps(value).replace("Infinity", "inf").replace("NaN", "nan")
+    with pytest.raises(EmulatorError, match=rf"sensor\.{field}: must be .* \(given: ") as caught:
+        load_profile("ideal", [f"sensor.{field}={given}"])
     assert "\n" not in str(caught.value)
 
 
-def test_unknown_sensor_fields_are_named() -> None:
-    with pytest.raises(EmulatorError, match=r"sensor\.apperture_m: unknown key; did you mean aperture_m"):
-        SensorModel().with_(apperture_m=0.01)
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("exposure_s", 0.0, "must be at least 1e-06 (given: 0.0)"),
+        ("exposure_s", np.nan, "must be at least 1e-06 (given: nan)"),
+        ("gain", 1e4, "must be at most 1000 (given: 10000.0)"),
+        ("temperature_c", np.inf, "must be at most 150 (given: inf)"),
+        ("bits", 10, "must be one of 8, 12, 16 (given: 10)"),
+    ],
+)
+def test_limits_also_hold_for_what_changes_during_a_run(field: str, value: float, said: str) -> None:
+    with pytest.raises(EmulatorError) as caught:
+        SensorModel().with_(**{field: value})
+    assert str(caught.value) == f"sensor.{field}: {said}"
+
+
+def test_limits_have_the_same_text_in_a_profile_and_during_a_run() -> None:
+    with pytest.raises(EmulatorError) as during_a_run:
+        SensorModel().with_(gain=-1.0)
+    with pytest.raises(EmulatorError) as in_a_profile:
+        load_profile("ideal", ["sensor.gain=-1.0"])
+    assert str(in_a_profile.value).endswith(str(during_a_run.value))
 
 
 @pytest.mark.parametrize("rate", [(0.0, 0.0), (np.nan, 0.0, 0.0), (100.0, 0.0, 0.0)])

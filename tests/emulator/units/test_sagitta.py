@@ -23,8 +23,8 @@ SOLUTION, TEMPERATURE = 24, 27
 UNIX_US = 1_800_000_000_123_456
 
 
-def request(klass: int, row: int, data: bytes = b"") -> bytes:
-    body = bytes([0x21, klass, row]) + data
+def request(message_class: int, row: int, data: bytes = b"") -> bytes:
+    body = bytes([0x21, message_class, row]) + data
     return slip(body + xxh32(body, 1425).to_bytes(4, "little"))
 
 
@@ -37,9 +37,9 @@ def replies(stream: bytes) -> list[bytes]:
     return [body[:-4] for body in bodies]
 
 
-def ask(unit: Emulated, klass: int, row: int, data: bytes = b"") -> bytes:
-    (reply,) = replies(unit.ask(request(klass, row, data)))
-    assert reply[1:3] == bytes([128 + klass, row])
+def ask(unit: Emulated, message_class: int, row: int, data: bytes = b"") -> bytes:
+    (reply,) = replies(unit.ask(request(message_class, row, data)))
+    assert reply[1:3] == bytes([128 + message_class, row])
     return reply[3:]
 
 

@@ -111,8 +111,8 @@ def answer_in_parts(unit: Emulated, command: int, data: bytes) -> bytes:
 
 def test_parts_of_the_driver_s_structures_have_what_was_seen():
     def scenario(unit: Emulated) -> None:
-        shot = unit.bench.device.snapshot()
-        stars, frame = shot.stars, shot.frame
+        snapshot = unit.bench.device.snapshot()
+        stars, frame = snapshot.stars, snapshot.frame
         first = stars[0]
         for image in (combination(unit, 0x80)[:392], combination(unit, 0x80)[392:]):
             flag, code, _, peaks, _, captured = struct.unpack_from("<IiiI2d", image)

@@ -24,7 +24,7 @@ END = b"\x1f\xff"
     ("answer", "text"),
     [
         (Answer("nack", 3, row_id=5), "refusal of 5 with code 3"),
-        (Answer("nack", 3, row_id=5, klass="set"), "refusal of set 5 with code 3"),
+        (Answer("nack", 3, row_id=5, message_class="set"), "refusal of set 5 with code 3"),
         (Answer("telemetry", data=b"\1\2"), "telemetry, 2 bytes: 01 02"),
         (Answer("burst", data=bytes(30), row_id=119), f"burst of 119, 30 bytes: {bytes(24).hex(' ')}"),
         (Answer("malformed", data=b"\xff"), "malformed, 1 bytes: ff"),

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from starhil.hil_tests.judge.definition import read_unit
+from starhil.hil_tests.judge.rows import Field
 
 HEAD = """
 [unit]
@@ -35,87 +36,116 @@ provenance = "ours"
 BIG = HEAD.replace('"little"', '"big"')
 OMITTED = HEAD.replace('byte_order = "little"\n', "")
 
-# name, kind, type, order, offset, shift, width, scale, unit of measure
 VECTORS = {
     "a text is a number with unit and scale": (
-        HEAD, 'fields = ["i16 a uT 0.01", "f32 b"]',
-        [("a", "integer", "i16", "little", 0, 0, 0, 0.01, "uT"), ("b", "float", "f32", "little", 2, 0, 0, 1.0, "")],
+        HEAD,
+        'fields = ["i16 a uT 0.01", "f32 b"]',
+        [
+            "a integer i16 at 0 x 0.01 uT",
+            "b float f32 at 2",
+        ],
     ),
     "braces are numbered from left to right, the last one fastest": (
-        HEAD, 'fields = ["u8 m{0,1}_{x,y}", "u16 c{8..10}"]',
+        HEAD,
+        'fields = ["u8 m{0,1}_{x,y}", "u16 c{8..10}"]',
         [
-            ("m0_x", "integer", "u8", "little", 0, 0, 0, 1.0, ""), ("m0_y", "integer", "u8", "little", 1, 0, 0, 1.0, ""),
-            ("m1_x", "integer", "u8", "little", 2, 0, 0, 1.0, ""), ("m1_y", "integer", "u8", "little", 3, 0, 0, 1.0, ""),
-            ("c8", "integer", "u16", "little", 4, 0, 0, 1.0, ""), ("c9", "integer", "u16", "little", 6, 0, 0, 1.0, ""),
-            ("c10", "integer", "u16", "little", 8, 0, 0, 1.0, ""),
+            "m0_x integer u8 at 0",
+            "m0_y integer u8 at 1",
+            "m1_x integer u8 at 2",
+            "m1_y integer u8 at 3",
+            "c8 integer u16 at 4",
+            "c9 integer u16 at 6",
+            "c10 integer u16 at 8",
         ],
     ),
     "bits of a text fill bytes from the lowest bit on": (
-        HEAD, 'fields = ["u8 -", "bits a:4 b{0..2} - c:8"]',
+        HEAD,
+        'fields = ["u8 -", "bits a:4 b{0..2} - c:8"]',
         [
-            ("", "unused", "u8", "little", 0, 0, 0, 1.0, ""), ("a", "bits", "u8", "little", 1, 0, 4, 1.0, ""),
-            ("b0", "flag", "u8", "little", 1, 4, 1, 1.0, ""), ("b1", "flag", "u8", "little", 1, 5, 1, 1.0, ""),
-            ("b2", "flag", "u8", "little", 1, 6, 1, 1.0, ""), ("", "unused", "u8", "little", 1, 7, 1, 1.0, ""),
-            ("c", "bits", "u8", "little", 2, 0, 8, 1.0, ""),
+            "- unused u8 at 0",
+            "a bits u8 at 1.0:4",
+            "b0 flag u8 at 1.4:1",
+            "b1 flag u8 at 1.5:1",
+            "b2 flag u8 at 1.6:1",
+            "- unused u8 at 1.7:1",
+            "c bits u8 at 2.0:8",
         ],
     ),
     "strings have their sizes": (
-        HEAD, 'fields = ["bytes a 3", "text b 2", "u8 c"]',
+        HEAD,
+        'fields = ["bytes a 3", "text b 2", "u8 c"]',
         [
-            ("a", "bytes", "bytes", "little", 0, 0, 0, 1.0, ""), ("b", "text", "bytes", "little", 3, 0, 0, 1.0, ""),
-            ("c", "integer", "u8", "little", 5, 0, 0, 1.0, ""),
+            "a bytes bytes at 0",
+            "b text bytes at 3",
+            "c integer u8 at 5",
         ],
     ),
     "count numbers a field from 1 on": (
-        HEAD, 'fields = [{ name = "a", type = "u16", count = 2 }]',
-        [("a_1", "integer", "u16", "little", 0, 0, 0, 1.0, ""), ("a_2", "integer", "u16", "little", 2, 0, 0, 1.0, "")],
+        HEAD,
+        'fields = [{ name = "a", type = "u16", count = 2 }]',
+        [
+            "a_1 integer u16 at 0",
+            "a_2 integer u16 at 2",
+        ],
     ),
     "repeat interleaves its fields": (
-        HEAD, 'fields = [{ repeat = { count = 2, fields = [{ name = "a", type = "u8" }, { name = "b", type = "u16" }] } }]',
+        HEAD,
+        'fields = [{ repeat = { count = 2, fields = [{ name = "a", type = "u8" }, { name = "b", type = "u16" }] } }]',
         [
-            ("a_1", "integer", "u8", "little", 0, 0, 0, 1.0, ""), ("b_1", "integer", "u16", "little", 1, 0, 0, 1.0, ""),
-            ("a_2", "integer", "u8", "little", 3, 0, 0, 1.0, ""), ("b_2", "integer", "u16", "little", 4, 0, 0, 1.0, ""),
+            "a_1 integer u8 at 0",
+            "b_1 integer u16 at 1",
+            "a_2 integer u8 at 3",
+            "b_2 integer u16 at 4",
         ],
     ),
     "include is in front": (
-        HEAD, 'include = ["part"]\nfields = ["u8 third"]',
+        HEAD,
+        'include = ["part"]\nfields = ["u8 third"]',
         [
-            ("first", "integer", "u8", "little", 0, 0, 0, 1.0, ""), ("second", "integer", "i16", "little", 1, 0, 0, 0.5, "V"),
-            ("third", "integer", "u8", "little", 3, 0, 0, 1.0, ""),
+            "first integer u8 at 0",
+            "second integer i16 at 1 x 0.5 V",
+            "third integer u8 at 3",
         ],
     ),
     "a map is an enumeration": (
-        HEAD, 'fields = [{ name = "a", type = "u8", map = { 7 = "on", 0x10 = "off" } }]',
-        [("a", "enum", "u8", "little", 0, 0, 0, 1.0, "")],
+        HEAD,
+        'fields = [{ name = "a", type = "u8", map = { 7 = "on", 0x10 = "off" } }]',
+        [
+            "a enum u8 at 0",
+        ],
     ),
     "the byte order of the unit, unless a field has its own": (
-        BIG, 'fields = [{ name = "a", type = "u16" }, { name = "b", type = "u16", order = "little" }]',
-        [("a", "integer", "u16", "big", 0, 0, 0, 1.0, ""), ("b", "integer", "u16", "little", 2, 0, 0, 1.0, "")],
+        BIG,
+        'fields = [{ name = "a", type = "u16" }, { name = "b", type = "u16", order = "little" }]',
+        [
+            "a integer u16 at 0 big",
+            "b integer u16 at 2",
+        ],
     ),
     "an omitted byte order is little-endian": (
-        OMITTED, 'fields = ["u32 a"]', [("a", "integer", "u32", "little", 0, 0, 0, 1.0, "")],
+        OMITTED,
+        'fields = ["u32 a"]',
+        [
+            "a integer u32 at 0",
+        ],
     ),
-}  # fmt: skip
+}
+"""A case: start of the unit, fields of its row, and these expanded; see `described`."""
+
+
+def described(item: Field) -> str:
+    """Return a field as `name kind type at offset.bit:width order x scale unit`, without bits, little-endian order and scale 1."""
+    bits = f".{item.shift}:{item.width}" if item.width or item.shift else ""
+    order = "" if item.order == "little" else f" {item.order}"
+    scale = "" if item.scale == 1.0 else f" x {item.scale:g}"
+    return f"{item.name or '-'} {item.kind} {item.type} at {item.offset}{bits}{order}{scale} {item.unit}".rstrip()
 
 
 @pytest.mark.parametrize("vector", VECTORS)
 def test_an_entry_expands_to_the_fields_worked_out_by_hand(tmp_path: Path, vector: str) -> None:
     head, fields, expected = VECTORS[vector]
     (tmp_path / "unit.toml").write_text(head + ROW + fields, encoding="utf-8")
-    assert [
-        (
-            item.name,
-            item.kind,
-            item.type,
-            item.order,
-            item.offset,
-            item.shift,
-            item.width,
-            item.scale,
-            item.unit,
-        )
-        for item in read_unit(tmp_path).telemetry["row"].fields
-    ] == expected
+    assert [described(item) for item in read_unit(tmp_path).telemetry["row"].fields] == expected
 
 
 def test_the_numbers_of_a_map_and_their_names(tmp_path: Path) -> None:

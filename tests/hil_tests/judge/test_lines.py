@@ -66,7 +66,7 @@ def test_both_sides_of_the_line_agree_with_the_product(name, dialect):
         assert line.encode(request) == stack.encode_request(icd.request(known, request.data)), row
         kind = ReplyKind.TELEMETRY if row.is_telemetry else ReplyKind.ACK
         sent = stack.encode_reply(
-            Reply(kind, row.id, data if row.is_telemetry else b"", klass=row.klass), style
+            Reply(kind, row.id, data if row.is_telemetry else b"", message_class=row.message_class), style
         )
         echo = line.encode(request) if "echo" in row.answers else b""
         line.expect(request)
@@ -74,7 +74,7 @@ def test_both_sides_of_the_line_agree_with_the_product(name, dialect):
         assert (answer.kind, answer.data if row.is_telemetry else data) == (kind.value, data), row
         assert answer.row_id in (None, row.id)
         refusal = stack.encode_reply(
-            Reply(ReplyKind.NACK, row.id, code=ErrorCode.BUSY, klass=row.klass), style
+            Reply(ReplyKind.NACK, row.id, code=ErrorCode.BUSY, message_class=row.message_class), style
         )
         if refusal and not (row.size == 1 and line.dialect in ("a", "b")):
             line.clear()
@@ -89,7 +89,7 @@ def test_a_changed_byte_is_not_taken_for_the_answer(name):
     line = SerialLine(unit)
     row = max((item for item in unit.telemetry.values()), key=lambda item: item.size < 40)
     sent = SerialStack(icd).encode_reply(
-        Reply(ReplyKind.TELEMETRY, row.id, bytes(range(64, 64 + row.size)), klass=row.klass)
+        Reply(ReplyKind.TELEMETRY, row.id, bytes(range(64, 64 + row.size)), message_class=row.message_class)
     )
     covered = range(len(sent)) if "header" in unit.serial.check.covers else range(6, len(sent) - 2)
     for place in covered:
@@ -194,8 +194,8 @@ def test_can_frames_are_the_published_vectors():
 
 def test_classes_and_ids_name_the_kind_of_an_unknown_id():
     sagitta = read_unit("sagitta")
-    assert sagitta.request(200, klass="parameter").telemetry
-    assert not sagitta.request(200, klass="action").telemetry
+    assert sagitta.request(200, message_class="parameter").telemetry
+    assert not sagitta.request(200, message_class="action").telemetry
     assert not read_unit("cubestar").request(31).telemetry
 
 

@@ -83,6 +83,7 @@ def test_an_emulator_that_does_not_end_well_is_reported(monkeypatch, lines, mess
     assert not process.running
 
 
+@pytest.mark.process
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_a_restarted_emulator_is_another_process_with_the_same_command(number):
     with emulator("import signal, sys; signal.signal(15, lambda *_: sys.exit(0))", READY, FOREVER) as process:
@@ -144,6 +145,7 @@ def with_parent(parent: int, *command: str) -> subprocess.CompletedProcess[str]:
     )  # fmt: skip
 
 
+@pytest.mark.process
 def test_a_command_runs_with_its_parent_and_ends_at_once_if_that_has_ended():
     assert with_parent(os.getpid(), "/bin/echo", "alive").stdout == "alive\n"
     assert with_parent(1 if os.getppid() != 1 else 2, "/bin/sleep", "600").returncode == -signal.SIGTERM

@@ -171,6 +171,14 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
         ),
         ('[truth]\nfile = "a\\u0000b"\n[[step]]\nwait_s = 1', ["truth.file: ", "has the character NUL"]),
         ("[[step]]\ndownload_image = 'x.png'\nsize = 'size_100'", ["size_100", "size_1024"]),
+        (
+            "[[step]]\nsend = 'set_mode'",
+            ["send.0: takes raw data, and 'set_mode' is a telecommand: use command"],
+        ),
+        (
+            "[[step]]\nsend = 'identification'",
+            ["send.0: takes raw data, and 'identification' is telemetry: use read"],
+        ),
         ("[[step]]\nsend = 'zz'", ["send.0: must be bytes in hexadecimal"]),
         ("[[step]]\nsend = ['1F', '123#00']", ["not both"]),
         ("[[step]]\nsend = '123#001'", ["not a CAN frame"]),

@@ -62,6 +62,7 @@ def processes(monkeypatch, device, hub):
     return ready, started, viewers
 
 
+@pytest.mark.process
 def test_each_link_is_measured_at_each_rate_without_and_with_viewers(processes):
     _, started, viewers = processes
     said = []

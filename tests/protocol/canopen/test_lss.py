@@ -7,7 +7,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from starhil.protocol.canopen.context import UNCONFIGURED, NmtState
+from starhil.protocol.canopen.context import UNCONFIGURED_NODE, NmtState
 from starhil.protocol.canopen.storage import ParameterStorage, StorageError
 
 VENDOR, PRODUCT, REVISION, SERIAL = 0, 0x53544152, 0x10000, 1
@@ -288,7 +288,7 @@ def test_whatever_lss_frames_arrive_the_node_is_found_again(new_bench, seed):
     bench = new_bench(storage=storage).power_on()
     commands = (0x04, 0x11, 0x13, 0x15, 0x17, 0x40, 0x41, 0x42, 0x43, 0x46, 0x4C, 0x51, 0x5E)
     for _ in range(150):
-        values = (0, 1, 1, 0x21, UNCONFIGURED, rng.randrange(256))
+        values = (0, 1, 1, 0x21, UNCONFIGURED_NODE, rng.randrange(256))
         lss(bench, bytes((rng.choice(commands), rng.choice(values))) + rng.randbytes(6))
         if rng.random() < 0.03:
             bench.nmt(rng.choice((129, 130)), 0)
@@ -297,7 +297,7 @@ def test_whatever_lss_frames_arrive_the_node_is_found_again(new_bench, seed):
         assert answering(bench) == []
         bench.advance(LONGEST_SILENCE_S)
     node = bench.slave.node_id
-    if node == UNCONFIGURED:
+    if node == UNCONFIGURED_NODE:
         assert answering(bench) == []
         for frame in ("04 01", "11 21", "04 00"):
             lss(bench, frame)

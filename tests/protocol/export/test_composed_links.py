@@ -32,7 +32,7 @@ def python_link(name: str) -> Any:
 
 
 def key_of(stack: SerialStack, message: Request | Reply) -> int:
-    return row_key(stack.classes, message.klass, message.id or 0)
+    return row_key(stack.classes, message.message_class, message.id or 0)
 
 
 def expected(stack: SerialStack, reply: Reply) -> tuple[str, int, bytes]:
@@ -51,11 +51,11 @@ def test_the_device_reads_every_request(name: str) -> None:
     for request in REQUESTS[name]:
         (seen,) = stack.device().feed(link.request(key_of(stack, request), request.data), 0.0)
         assert isinstance(seen, Request)
-        assert (seen.kind, seen.id, seen.data, seen.klass) == (
+        assert (seen.kind, seen.id, seen.data, seen.message_class) == (
             request.kind,
             request.id,
             request.data,
-            request.klass,
+            request.message_class,
         )
 
 
@@ -99,10 +99,10 @@ def test_no_damaged_reply_is_taken_where_there_is_a_check(name: str) -> None:
 def test_an_echo_is_consumed_before_the_reply() -> None:
     stack, link = STACKS["nos3"], python_link("nos3")
     data = b"\xbe\xef" * 4 + b"\x01"
-    request = Request(RequestKind.TELEMETRY, 2, bytes(4), klass="telemetry")
+    request = Request(RequestKind.TELEMETRY, 2, bytes(4), message_class="telemetry")
     sent = link.request(2, bytes(4))
     assert sent == stack.encode_request(request)
-    reply = stack.encode_reply(Reply(ReplyKind.TELEMETRY, 2, data, klass="telemetry"))
+    reply = stack.encode_reply(Reply(ReplyKind.TELEMETRY, 2, data, message_class="telemetry"))
     assert link.receive(sent + reply) == [("telemetry", 2, data)]
     noop = link.request(0, bytes(4))
     assert link.receive(noop) == [("answer", 0, b"\0")]
@@ -179,11 +179,13 @@ def test_the_c_consumes_an_echo_before_the_reply(c: tuple[str, CDriver]) -> None
     name, driver = c
     stack = STACKS[name]
     data = b"\xbe\xef" * 4 + b"\x01"
-    echo = stack.encode_request(Request(RequestKind.TELEMETRY, 2, bytes(4), klass="telemetry"))
-    reply = stack.encode_reply(Reply(ReplyKind.TELEMETRY, 2, data, klass="telemetry"))
+    echo = stack.encode_request(Request(RequestKind.TELEMETRY, 2, bytes(4), message_class="telemetry"))
+    reply = stack.encode_reply(Reply(ReplyKind.TELEMETRY, 2, data, message_class="telemetry"))
     assert c_events(driver, 2, echo + reply) == [["1", "2", "0", data.hex()]]
     assert c_events(
-        driver, 0, stack.encode_request(Request(RequestKind.TELECOMMAND, 0, bytes(4), klass="command"))
+        driver,
+        0,
+        stack.encode_request(Request(RequestKind.TELECOMMAND, 0, bytes(4), message_class="command")),
     ) == [["2", "0", "0", "-"]]
 
 

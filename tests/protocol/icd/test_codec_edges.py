@@ -72,6 +72,16 @@ def test_a_float_outside_its_limits_is_refused_when_received(icd, value):
         row.decode(data)
 
 
+@pytest.mark.parametrize("field", ["single", "double", "centi"])
+@pytest.mark.parametrize("digits", [400, 20_000])
+def test_a_whole_number_beyond_all_floats_is_rejected(icd, field, digits):
+    values = {"single": 0.0, "double": 0.0, "centi": 0.0, field: -(16**digits)}
+    with pytest.raises(
+        FieldError, match=rf"set.{field}: a whole number of {4 * digits + 1} bits fits no field"
+    ):
+        icd.telecommands["set"].encode(values)
+
+
 @pytest.mark.parametrize(
     ("value", "raw", "read"), [(11.0, 2.0, 11.0), (-99.0, -40.0, -10.0), (99.0, 40.0, 30.0)]
 )
@@ -173,16 +183,16 @@ def test_a_can_id_with_unknown_flags_above_29_bits_is_read_without_them():
 
 
 @pytest.mark.parametrize(
-    ("klass", "row_id", "found", "kind"),
+    ("message_class", "row_id", "found", "kind"),
     [
         (None, 6, "set", RequestKind.TELECOMMAND),  # the first row with this ID
         ("parameter", 6, "parameter", RequestKind.TELEMETRY),
         (None, 250, "set", RequestKind.TELECOMMAND),  # no row: the first class
     ],
 )
-def test_a_request_by_id_has_the_class_of_its_row(klass, row_id, found, kind):
-    request = load_unit("sagitta").request_of(row_id, klass, b"\1")
-    assert (request.klass, request.kind, request.id, request.data) == (found, kind, row_id, b"\1")
+def test_a_request_by_id_has_the_class_of_its_row(message_class, row_id, found, kind):
+    request = load_unit("sagitta").request_of(row_id, message_class, b"\1")
+    assert (request.message_class, request.kind, request.id, request.data) == (found, kind, row_id, b"\1")
 
 
 def test_a_request_of_an_unknown_class_is_rejected_and_a_unit_without_classes_needs_none():

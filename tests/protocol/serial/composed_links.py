@@ -27,7 +27,7 @@ TC, TLM = RequestKind.TELECOMMAND, RequestKind.TELEMETRY
 
 
 def shape(
-    klass: str,
+    message_class: str,
     identifier: int,
     kind: RequestKind,
     request_size: int = 0,
@@ -37,7 +37,7 @@ def shape(
     """Return what a link needs of a row; the requests of telemetry may have data here."""
     keys = {
         "name": "",
-        "klass": klass,
+        "message_class": message_class,
         "id": identifier,
         "kind": kind,
         "request": "",
@@ -70,7 +70,7 @@ def definition(
     plugin: Plugin | None = None,
 ) -> InterfaceDefinition:
     """Return a unit that has only a serial link, with the rows in the order of their IDs."""
-    named = [(f"{row.klass} {row.id}", row) for row in rows]
+    named = [(f"{row.message_class} {row.id}", row) for row in rows]
     telecommands = [(name, row) for name, row in named if row.kind is TC]
     return InterfaceDefinition(
         "test", "1", "", Names("telecommand", telecommands),
@@ -240,15 +240,15 @@ STACKS = {
 
 REQUESTS: dict[str, list[Request]] = {
     "sagitta": [
-        Request(TC, 6, bytes(range(16)), klass="set"),
-        Request(TLM, 6, klass="get"),
-        Request(TLM, 24, klass="telemetry"),
-        Request(TC, 14, b"\xc0\xdb\xdc\xdd\xc0\xc0\xdb\xdb", klass="action"),
+        Request(TC, 6, bytes(range(16)), message_class="set"),
+        Request(TLM, 6, message_class="get"),
+        Request(TLM, 24, message_class="telemetry"),
+        Request(TC, 14, b"\xc0\xdb\xdc\xdd\xc0\xc0\xdb\xdb", message_class="action"),
     ],
     "nos3": [
-        Request(TC, 0, b"\xde\xad\xbe\xef", klass="command"),
-        Request(TLM, 1, bytes(4), klass="telemetry"),
-        Request(TLM, 2, b"\0\0\0\x07", klass="telemetry"),
+        Request(TC, 0, b"\xde\xad\xbe\xef", message_class="command"),
+        Request(TLM, 1, bytes(4), message_class="telemetry"),
+        Request(TLM, 2, b"\0\0\0\x07", message_class="telemetry"),
     ],
     "nsp": [Request(TLM, 0, source=0x11), Request(TC, 1, b"\0\x20\0\0", source=0x12)],
     "length": [Request(TC, 3, b"\xaa\x55", sequence=7), Request(TLM, 200, sequence=255)],
@@ -260,18 +260,18 @@ REQUESTS: dict[str, list[Request]] = {
 
 REPLIES: dict[str, list[Reply]] = {
     "sagitta": [
-        Reply(ReplyKind.ACK, 6, klass="set"),
-        Reply(ReplyKind.NACK, 6, code=ErrorCode.INVALID_PARAMETER, klass="set"),
-        Reply(ReplyKind.TELEMETRY, 6, b"\xc0" * 16, klass="get"),
+        Reply(ReplyKind.ACK, 6, message_class="set"),
+        Reply(ReplyKind.NACK, 6, code=ErrorCode.INVALID_PARAMETER, message_class="set"),
+        Reply(ReplyKind.TELEMETRY, 6, b"\xc0" * 16, message_class="get"),
         Reply(
             ReplyKind.TELEMETRY,
             24,
             b"\xdb" * 67,
-            klass="telemetry",
+            message_class="telemetry",
             uptime_ns=12_000_000,
             time_ns=1_700_000_000_123_456_000,
         ),
-        Reply(ReplyKind.UNSOLICITED, 24, bytes(67), klass="telemetry", time_ns=1_000),
+        Reply(ReplyKind.UNSOLICITED, 24, bytes(67), message_class="telemetry", time_ns=1_000),
     ],
     "nsp": [
         Reply(ReplyKind.TELEMETRY, 0, b"ST-16\xc0\xdb!", destination=0x11),

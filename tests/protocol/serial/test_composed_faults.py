@@ -78,8 +78,10 @@ def test_unknown_class_is_flagged() -> None:
 
 
 def test_unknown_id_is_a_request_that_the_device_refuses() -> None:
-    (request,) = SAGITTA.device().feed(SAGITTA.encode_request(Request(TLM, 99, klass="telemetry")), 0.0)
-    assert request == Request(TLM, 99, klass="telemetry")
+    (request,) = SAGITTA.device().feed(
+        SAGITTA.encode_request(Request(TLM, 99, message_class="telemetry")), 0.0
+    )
+    assert request == Request(TLM, 99, message_class="telemetry")
 
 
 @pytest.mark.parametrize("name", STACKS)

@@ -61,27 +61,28 @@ def test_hdlc_substitutes_with_xor() -> None:
 def test_request_for_the_sagitta_solution_has_the_published_bytes() -> None:
     # 21 02 18 and XXH32 with seed 1425 over these three bytes, computed from its specification by hand.
     assert (
-        SAGITTA.encode_request(Request(TLM, 24, klass="telemetry")).hex(" ") == "c0 21 02 18 ac 15 e1 76 c0"
+        SAGITTA.encode_request(Request(TLM, 24, message_class="telemetry")).hex(" ")
+        == "c0 21 02 18 ac 15 e1 76 c0"
     )
 
 
 def test_sagitta_solution_reply_has_87_bytes_between_the_flags() -> None:
-    sent = SAGITTA.encode_reply(Reply(ReplyKind.TELEMETRY, 24, bytes(67), klass="telemetry"))
+    sent = SAGITTA.encode_reply(Reply(ReplyKind.TELEMETRY, 24, bytes(67), message_class="telemetry"))
     assert len(sent) >= 87 + 2
     assert sent[1:5] == bytes((0x21, 130, 24, 0))
 
 
 def test_sagitta_parameter_reply_has_no_status() -> None:
-    assert SAGITTA.encode_reply(Reply(ReplyKind.TELEMETRY, 6, bytes(16), klass="get"))[1:4] == bytes(
+    assert SAGITTA.encode_reply(Reply(ReplyKind.TELEMETRY, 6, bytes(16), message_class="get"))[1:4] == bytes(
         (0x21, 129, 6)
     )
 
 
 def test_nos3_request_and_replies_have_the_published_bytes() -> None:
-    request = Request(TLM, 2, bytes(4), klass="telemetry")
+    request = Request(TLM, 2, bytes(4), message_class="telemetry")
     assert NOS3.encode_request(request).hex().upper() == "DEAD0200000000BEEF"
     assert NOS3.encode_reply(Reply.echo(request)) == NOS3.encode_request(request)
-    reply = Reply(ReplyKind.TELEMETRY, 2, bytes(9), klass="telemetry")
+    reply = Reply(ReplyKind.TELEMETRY, 2, bytes(9), message_class="telemetry")
     assert NOS3.encode_reply(reply).hex().upper() == "DEAD" + "00" * 9 + "BEEF"
 
 
@@ -126,7 +127,7 @@ def test_the_host_reads_replies(name: str, reply: Reply) -> None:
     if reply.kind is ReplyKind.NACK and "status" not in STACKS[name].replies.header.roles:
         assert found.kind is ReplyKind.NACK
         return
-    keys = ("kind", "id", "data", "code", "klass", "sequence", "final", "uptime_ns", "time_ns")
+    keys = ("kind", "id", "data", "code", "message_class", "sequence", "final", "uptime_ns", "time_ns")
     assert {key: getattr(found, key) for key in keys} == {key: getattr(reply, key) for key in keys}
 
 
@@ -134,7 +135,9 @@ def test_host_verifies_the_echo_before_the_reply() -> None:
     receiver = NOS3.host()
     request = REQUESTS["nos3"][2]
     echo = receiver.request(request)
-    reply = NOS3.encode_reply(Reply(ReplyKind.TELEMETRY, 2, b"\xbe\xef" * 4 + b"\x01", klass="telemetry"))
+    reply = NOS3.encode_reply(
+        Reply(ReplyKind.TELEMETRY, 2, b"\xbe\xef" * 4 + b"\x01", message_class="telemetry")
+    )
     events = receiver.feed(echo + reply, 0.0)
     assert [(event.kind, event.id, event.data) for event in events if isinstance(event, Reply)] == [
         (ReplyKind.TELEMETRY, 2, b"\xbe\xef" * 4 + b"\x01")
@@ -159,13 +162,15 @@ def test_echo_is_the_ack_of_a_telecommand_that_has_no_other_answer() -> None:
 
 def test_refusal_that_the_header_cannot_express_sends_nothing() -> None:
     assert NOS3.encode_reply(Reply(ReplyKind.NACK, 2, code=ErrorCode.BUSY)) == b""
-    assert SAGITTA.encode_reply(Reply(ReplyKind.NACK, 99, code=ErrorCode.INVALID_ID, klass="get")) == b""
-    assert SAGITTA.encode_reply(Reply(ReplyKind.NACK, 99, code=ErrorCode.INVALID_ID, klass="set"))
+    assert (
+        SAGITTA.encode_reply(Reply(ReplyKind.NACK, 99, code=ErrorCode.INVALID_ID, message_class="get")) == b""
+    )
+    assert SAGITTA.encode_reply(Reply(ReplyKind.NACK, 99, code=ErrorCode.INVALID_ID, message_class="set"))
 
 
 def test_code_that_does_not_fit_the_header_is_an_error() -> None:
     with pytest.raises(ProtocolError, match=r"link\.serial\.reply_header: status 300 does not fit 8 bits"):
-        SAGITTA.encode_reply(Reply(ReplyKind.NACK, 6, code=300, klass="set"))
+        SAGITTA.encode_reply(Reply(ReplyKind.NACK, 6, code=300, message_class="set"))
 
 
 def test_binary_message_that_contains_the_delimiter_is_an_error_with_a_remedy() -> None:
@@ -198,9 +203,9 @@ def test_length_counts_and_check_covers_the_parts_that_are_named(
 @settings(max_examples=200, deadline=None)
 @given(name=st.sampled_from([name for name in STACKS if name != "nos3"]), data=st.binary(max_size=40))
 def test_any_data_arrives_as_it_was_sent(name: str, data: bytes) -> None:
-    klass = "action" if name == "sagitta" else ""
+    message_class = "action" if name == "sagitta" else ""
     row_id = 14 if name == "sagitta" else 3
-    request = Request(TC, row_id, data, source=0x11 if name == "nsp" else 0, klass=klass)
+    request = Request(TC, row_id, data, source=0x11 if name == "nsp" else 0, message_class=message_class)
     (found,) = STACKS[name].device().feed(STACKS[name].encode_request(request), 0.0)
     assert isinstance(found, Request)
     assert (found.id, found.data) == (row_id, data)

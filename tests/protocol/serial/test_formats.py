@@ -32,7 +32,7 @@ STUFFED = stack_of(
 
 
 def record(data: bytes) -> Reply:
-    return Reply(ReplyKind.TELEMETRY, 128, data, klass="record")
+    return Reply(ReplyKind.TELEMETRY, 128, data, message_class="record")
 
 
 def test_the_bytes_of_the_range_are_sent_as_two() -> None:
@@ -62,7 +62,7 @@ def test_a_message_cut_off_by_another_is_flagged_and_the_other_read() -> None:
 
 def test_requests_are_texts_and_replies_text_or_binary() -> None:
     assert STACK.encode_request(RECORD) == b"show record\r"
-    assert STACK.encode_reply(Reply(ReplyKind.ACK, 3, klass="command")) == b"READY\r\n"
+    assert STACK.encode_reply(Reply(ReplyKind.ACK, 3, message_class="command")) == b"READY\r\n"
     assert STACK.encode_reply(Reply(ReplyKind.NACK, 129, code=ErrorCode.INVALID_ID)) == b"ERROR 1\r\n"
     sent = STACK.encode_reply(record(b"\xf7" * 51))
     assert sent[0] == 0xF1
@@ -87,7 +87,7 @@ def test_the_host_reads_each_format_and_names_the_request() -> None:
     sent = STACK.encode_reply(record(bytes(range(0xC0, 0xF3))))
     (reply,) = [event for byte in sent for event in host.feed(bytes((byte,)), 0.0)]
     assert isinstance(reply, Reply)
-    assert (reply.kind, reply.id, reply.klass, reply.data) == (
+    assert (reply.kind, reply.id, reply.message_class, reply.data) == (
         ReplyKind.TELEMETRY, 128, "record", bytes(range(0xC0, 0xF3)),
     )  # fmt: skip
     host.overhear(RECORD)
@@ -139,8 +139,8 @@ def test_a_damaged_record_is_flagged_and_the_next_read() -> None:
 
 def test_a_request_that_no_text_expresses_is_an_error() -> None:
     for request in (
-        Request(TLM, 128, b"\0", klass="record"),
-        Request(RequestKind.TELECOMMAND, 99, klass="command"),
+        Request(TLM, 128, b"\0", message_class="record"),
+        Request(RequestKind.TELECOMMAND, 99, message_class="command"),
     ):
         with pytest.raises(ProtocolError, match=r"link\.serial: no text|link\.serial: a text has no data"):
             STACK.encode_request(request)

@@ -49,6 +49,12 @@ async def until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.002)
 
 
+async def turns(count: int = 50) -> None:
+    """Let the loop do what is due, if there is anything."""
+    for _ in range(count):
+        await asyncio.sleep(0)
+
+
 class SerialPair:
     """Two connected ends and what each has received."""
 

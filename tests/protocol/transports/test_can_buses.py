@@ -14,10 +14,19 @@ import pytest
 
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.transports.base import TransportError
+from starhil.protocol.transports.base import TURN_S, TransportError
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.python_can import QUEUE_LIMIT, PythonCanTransport
-from tests.protocol.transports.pairs import CAN_KINDS, DEADLINE_S, FRAMES, HAS_VCAN, can_pair, until
+from tests.protocol.transports.pairs import CAN_KINDS, DEADLINE_S, FRAMES, HAS_VCAN, CanPair, can_pair, until
+
+MARK = CanFrame(0x7A5, b"end", extended=False)
+
+
+async def exchange_marks(pair: CanPair) -> None:
+    """Send a last frame both ways; an echo of what was sent before would arrive sooner."""
+    for transport in (pair.one, pair.two):
+        assert transport.send(MARK)
+    await until(lambda: MARK in pair.got_one and MARK in pair.got_two)
 
 
 @pytest.mark.parametrize("kind", CAN_KINDS)
@@ -31,11 +40,11 @@ def test_frames_pass_both_ways_intact_in_order_and_without_echo(kind: str) -> No
             for frame in FRAMES[::-1]:
                 assert pair.two.send(frame)
             await until(lambda: len(pair.got_one) >= len(FRAMES))
-            await asyncio.sleep(0.05)
-            assert pair.got_two == FRAMES
-            assert pair.got_one == FRAMES[::-1]
+            await exchange_marks(pair)
+            assert pair.got_two == [*FRAMES, MARK]
+            assert pair.got_one == [*FRAMES[::-1], MARK]
             assert not pair.errors
-            assert pair.one.statistics.sent == pair.one.statistics.received == len(FRAMES)
+            assert pair.one.statistics.sent == pair.one.statistics.received == len(FRAMES) + 1
 
     asyncio.run(main())
 
@@ -80,6 +89,24 @@ def test_a_burst_leaves_the_loop_to_others_after_some_15_frames(kind: str) -> No
     asyncio.run(main())
 
 
+@pytest.mark.parametrize("kind", ["hub", "slcan", CAN_KINDS[-1]])
+def test_frames_that_are_much_work_leave_the_loop_to_others_one_by_one(kind: str) -> None:
+    async def main() -> None:
+        async with can_pair(kind) as pair:
+            pair.two.listener = lambda _frame: time.sleep(1.5 * TURN_S)
+            counts = [0]
+            for number in range(60):
+                pair.one.send(CanFrame(number, bytes(8), extended=False))
+            async with asyncio.timeout(DEADLINE_S):
+                while counts[-1] < 60:
+                    await asyncio.sleep(0)
+                    counts.append(len(pair.got_two))
+            assert max(after - before for before, after in pairwise(counts)) == 1
+            assert [frame.id for frame in pair.got_two] == list(range(60))
+
+    asyncio.run(main())
+
+
 def test_identical_frames_of_two_nodes_are_not_echoes() -> None:
     async def main() -> None:
         async with can_pair("udp_multicast") as pair:
@@ -87,8 +114,8 @@ def test_identical_frames_of_two_nodes_are_not_echoes() -> None:
                 pair.one.send(FRAMES[0])
                 pair.two.send(FRAMES[0])
             await until(lambda: len(pair.got_one) >= 20 and len(pair.got_two) >= 20)
-            await asyncio.sleep(0.05)
-            assert pair.got_one == pair.got_two == [FRAMES[0]] * 20
+            await exchange_marks(pair)
+            assert pair.got_one == pair.got_two == [FRAMES[0]] * 20 + [MARK]
 
     asyncio.run(main())
 
@@ -263,14 +290,15 @@ def test_frames_that_wait_when_a_bus_is_closed_are_counted_as_dropped() -> None:
 
 def test_a_bus_whose_opening_is_cancelled_is_closed() -> None:
     async def main() -> None:
-        bus, may_open = _ScriptedBus(), threading.Event()
+        bus, begun, may_open = _ScriptedBus(), threading.Event(), threading.Event()
 
         def open_late() -> can.BusABC:
+            begun.set()
             may_open.wait()
             return bus
 
         opening = asyncio.ensure_future(PythonCanTransport("late:0", open_late).start(lambda _: None))
-        await asyncio.sleep(0.01)
+        await until(begun.is_set)
         opening.cancel()
         may_open.set()
         with pytest.raises(asyncio.CancelledError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,7 +13,7 @@ from starhil.protocol.can.socketcand import format_send
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.connections import WINDOW
 from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub, FairQueue
-from tests.protocol.transports.pairs import until
+from tests.protocol.transports.pairs import turns, until
 
 FLOOD = CanFrame(0x123, bytes(8), extended=False)
 REQUEST = CanFrame(0x200, b"\x01", extended=False)
@@ -79,7 +80,7 @@ def test_a_flood_takes_the_place_of_no_other_clients_frame() -> None:
         other.write(format_send(REQUEST))
         before = hub.statistics.frames
         await until(lambda: hub.statistics.frames > before)
-        await asyncio.sleep(0.05)
+        await turns()
         reader._transport.resume_reading()  # type: ignore[attr-defined]
         async with asyncio.timeout(10):
             while b" 200 " not in await reader.readuntil(b">"):
@@ -122,11 +123,13 @@ def test_a_request_is_answered_before_most_of_a_flood_that_came_first() -> None:
             await asyncio.sleep(0)
         bench.send(REQUEST)
         await bench.drain()
-        await asyncio.sleep(0.05)
+        await turns()
         device._writer.transport.resume_reading()  # type: ignore[attr-defined]
         async with asyncio.timeout(60):
-            while not heard:
-                await asyncio.sleep(3.0)  # on a busy machine the device's own flood can push its reply out
+            while not heard:  # on a busy machine the device's own flood can push its reply out
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(3.0):
+                        await until(lambda: bool(heard))
                 bench.send(REQUEST)
         text = len("< frame 123 1700000000.250000 0000000000000000 >")
         assert handled_at[0] * text < BACKLOG_LIMIT

@@ -125,11 +125,11 @@ reply_header = [{ role = "length", type = "u8" }, { role = "id", type = "u8" }]
 classes = ["command"]
 framing = { kind = "fixed", start = [0x90], request_size = SIZE }
 """
-STREAMED = ATTITUDE.replace("ID", "3").replace("KEYS", "request = false\nunsolicited = 2.0")
+LEAST_MESSAGES = ATTITUDE.replace("ID", "3").replace("KEYS", "request = false\nunsolicited = 2.0")
 
 
 def formats(keys: str, size: int = 2) -> str:
-    return HEAD + STREAMED + FORMATS.replace("KEYS", keys).replace("SIZE", str(size))
+    return HEAD + LEAST_MESSAGES + FORMATS.replace("KEYS", keys).replace("SIZE", str(size))
 
 
 def test_a_class_without_messages_in_a_direction_needs_no_start_of_its_own(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ def exchanges(icd: InterfaceDefinition, stack: SerialStack) -> tuple[list[bytes]
         kind = ReplyKind.ACK if row.kind == "telecommand" else ReplyKind.TELEMETRY
         data = b"" if kind is ReplyKind.ACK else row.encode()
         if len(data) < 200:
-            replies.append(stack.encode_reply(Reply(kind, row.id, data, klass=row.klass)))
+            replies.append(stack.encode_reply(Reply(kind, row.id, data, message_class=row.message_class)))
     return requests, replies
 
 
@@ -71,7 +71,7 @@ def decode(icd: InterfaceDefinition, event: Request | Reply | LinkFault) -> bool
     """Decode the data of a message as its row says; return whether that is possible."""
     if isinstance(event, LinkFault):
         return False
-    row = icd.row(event.id or 0, event.klass)
+    row = icd.row(event.id or 0, event.message_class)
     if row is None:
         return False
     try:
@@ -90,7 +90,9 @@ def test_bytes_of_another_unit_are_flagged_and_survived(unit, other):
         events = [*receiver.feed(sent, number), *receiver.flush(number + 0.9)]
         faults = [event for event in events if isinstance(event, LinkFault)]
         known = [
-            event for event in events if isinstance(event, Request) and stack.icd.row(event.id, event.klass)
+            event
+            for event in events
+            if isinstance(event, Request) and stack.icd.row(event.id, event.message_class)
         ]
         assert not known, (sent.hex(), events)  # any line may be the text of a request, but of no row
         assert faults == events or stack.text_formats, (sent.hex(), events)

@@ -108,7 +108,7 @@ def test_rows_of_two_classes_may_have_one_id(unit):
     assert icd.row(5, "get").name == "one"
     assert icd.telemetry_row(5).name == "one"
     assert icd.telemetry_row(5, "watch").name == "two"
-    assert icd.request(icd.telemetry["two"]).klass == "watch"
+    assert icd.request(icd.telemetry["two"]).message_class == "watch"
 
 
 def test_a_flag_of_a_map_may_have_a_default(unit):

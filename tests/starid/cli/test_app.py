@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from starhil.emulator.cli.app import COMMANDS, MOVED
+from starhil.emulator.cli.app import COMMANDS
 from starhil.emulator.sensor.renderer import render
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -69,25 +69,11 @@ def test_a_photograph_is_annotated(photograph: Path, tmp_path: Path) -> None:
     assert (pixels[:, :, 1] != pixels[:, :, 2]).any()  # circles are coloured
 
 
-@pytest.mark.parametrize(("old", "new"), MOVED.items())
-def test_an_old_name_works_and_states_the_new_one(old: tuple[str, ...], new: str) -> None:
-    status, out, said = run_command_line(*old, "--help")
-    assert (status, said) == (0, f"starhil {' '.join(old)}: is now starid {new}\n")
-    assert f"Usage: starid {new}" in out
-    assert (status, out, "") == run_command_line(new, "--help", program="starid")
-
-
-def test_an_old_name_rejects_as_the_new_one_does() -> None:
-    status, out, said = run_command_line("catalog", "--limit", "nan")
-    _, rejected = said.splitlines()
-    assert (status, out) == (2, "")
-    assert rejected.startswith("starid: catalog: invalid value for '--limit'")
-
-
 def test_no_sub_command_has_two_programs() -> None:
     assert {*COMMANDS} & {*app.COMMANDS} == {"bench"}
 
 
+@pytest.mark.process
 def test_only_the_module_of_the_given_sub_command_is_imported() -> None:
     program = "import sys; from starid.cli import app; app.build_app(['catalog']); print(*sys.modules)"
     done = subprocess.run(

@@ -59,11 +59,13 @@ def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def write_package(folder: Path, *, slope: float = 2.0) -> Path:
+    """Write a package with kernels; a file that would not change stays, since numba 0.60 knows it by its time."""
     package = folder / "other_kernels"
     package.mkdir(parents=True, exist_ok=True)
-    (package / "__init__.py").write_text("")
-    (package / "outer.py").write_text(CALLER)
-    (package / "inner.py").write_text(INNER.format(slope=slope))
+    for name, text in (("__init__", ""), ("outer", CALLER), ("inner", INNER.format(slope=slope))):
+        path = package / f"{name}.py"
+        if not path.exists() or path.read_text() != text:
+            path.write_text(text)
     return folder
 
 
@@ -307,6 +309,8 @@ def test_only_what_numba_publishes_is_used_and_sums_are_never_reordered() -> Non
                     modules = [each.name for each in names]
                 case ast.ImportFrom(module=str(module)):
                     modules = [module]
+                case ast.Constant(value=str(text)) if text.startswith(("numba.", "llvmlite.")):
+                    modules = [text]
                 case ast.keyword(arg="fastmath"):
                     raise AssertionError(f"{path}: fastmath reorders sums")
                 case _:

@@ -20,6 +20,7 @@ from starhil.emulator.sensor.pipeline.messages import (
 from starhil.emulator.sensor.pipeline.worker_process import WorkerThread
 from tests.emulator.runs import CAMERA
 from tests.emulator.workers import ANSWERING, WORKER
+from tests.protocol.transports.pairs import turns
 
 SETUP = pipeline_setup(Profile())
 WITHIN_S = 20.0
@@ -178,7 +179,7 @@ def test_a_start_that_fails_raises_once_and_is_no_loss(worker, program):
         try:
             with pytest.raises(EmulatorError, match=r"no catalogue|pipeline worker"):
                 await asyncio.wait_for(imager.start(), WITHIN_S)
-            await asyncio.sleep(0.1)
+            await turns()
         finally:
             await imager.close()
 

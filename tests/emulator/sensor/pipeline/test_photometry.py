@@ -9,7 +9,10 @@ import pytest
 
 from starhil.emulator.benchmarks.algorithms import AlgorithmPlan, Comparison, Scene
 from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
+from starhil.emulator.sensor.pipeline.messages import FrameRequest
 from starhil.emulator.sensor.pipeline.photometry import _limit_of
+from starhil.emulator.truth.source import TruthState
+from starid.attitude import Attitude, propagate
 
 
 @pytest.mark.parametrize(("profile", "low", "high"), [("cubestar", 3.25, 3.75), ("ideal", 5.5, 6.0)])
@@ -32,3 +35,19 @@ def test_the_limit_is_where_ninety_percent_are_found():
     photometry = _limit_of(magnitude, error)
     assert photometry.limit == pytest.approx(4.0, abs=0.25)
     assert photometry.sigma == pytest.approx(0.07, rel=0.15)
+
+
+def test_false_stars_are_counted_among_the_detections_and_among_those_removed():
+    device = EcssDevice(EcssPlan("ideal", ("run.algorithm=rsi",), 3))
+    rate = np.radians([0.0, 0.5, 0.0])
+    attitude = Attitude.from_radec_roll(83.8, -1.2, 0.0)
+    results = []
+    for index in range(3):
+        sky = {"false_stars": 8, "false_star_magnitudes": [2.0, 4.0]}
+        truth = TruthState(propagate(attitude, rate, float(index)), np.zeros(3))
+        request = FrameRequest(index, truth, device.exposure_s, device.gain, device.settings, faults=sky)
+        results.append(device.pipeline.handle(request))
+    assert [result.false_detected for result in results] == [8, 8, 8]  # they are bright, and rarely overlap
+    assert results[0].false_removed == 0  # the filter compares two images
+    assert results[2].false_removed >= 7
+    assert results[2].features.removed < results[2].detected / 4

@@ -1,6 +1,7 @@
 """Previews: the image for display, and what is in it."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from starhil.emulator.sensor.renderer import Frame, ObjectTruth, StarTruth
 from starhil.emulator.sensor.sky.objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
+from starid.identification.solution import FeatureReport, Reason, Solution
 
 CAMERA = Camera.from_fov(20.0, 200, 100)
 POINTING = Attitude.from_radec_roll(80.0, 10.0, 0.0)
@@ -95,3 +97,18 @@ def test_bodies_have_their_outline_where_the_lens_shows_it():
     ((x, y),) = planet["outline_px"]
     assert (planet["name"], x) == ("Jupiter", pytest.approx(99.5, abs=0.1))
     assert y < 49.5  # north is up
+
+
+def test_the_overlay_says_how_features_identified_the_image_and_what_the_filter_removed():
+    features = FeatureReport(
+        "rsi", removed_index=(3, 7), region_deg=2.0, region_at_deg=(83.8, -1.2), weights=4
+    )
+    solution = replace(Solution.invalid(Reason.NO_MATCH), features=features)
+    made = make_preview(frame(), CAMERA, SensorModel(), SkyObjects(), None, solution)
+    shown = json.loads(made.overlay)["features"]
+    assert (shown["removed"], shown["region_deg"], shown["region_at_deg"]) == ([3, 7], 2.0, [83.8, -1.2])
+    assert shown["error_psi"] is None  # not computed, and JSON has no NaN
+    plain = make_preview(
+        frame(), CAMERA, SensorModel(), SkyObjects(), None, Solution.invalid(Reason.NO_MATCH)
+    )
+    assert json.loads(plain.overlay)["features"] is None

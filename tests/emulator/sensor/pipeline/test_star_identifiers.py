@@ -1,5 +1,6 @@
 """The identifier in force answers while another is made beside it."""
 
+import json
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.profile import Profile
+from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.profile.pipeline_setup import pipeline_setup
 from starhil.emulator.sensor.pipeline.messages import FrameRequest
 from starhil.emulator.sensor.pipeline.pipeline import Pipeline
@@ -136,16 +137,22 @@ def test_without_a_thread_each_one_is_waited_for(factory):
             r"identifier\.nonsense: not an option of the algorithm geometric; known: blend_px, cache",
         ),
         ("geometric", "catalog", 1, "not an option"),
-        ("geometric", "blend_px", "x", r"identifier\.blend_px: must be float, not 'x'"),
-        ("geometric", "blend_px", True, "must be float, not True"),
-        ("lsi", "neighbours", 2.5, "must be int, not 2.5"),
-        ("lsi", "solver", 3, "must be str, not 3"),
-        ("rsi", "limiting_magnitude", "x", "must be float, not 'x'"),
+        ("geometric", "blend_px", "x", r"identifier\.blend_px: must be a number \(given: 'x'\)"),
+        ("geometric", "blend_px", True, r"must be a number \(given: True\)"),
+        ("lsi", "neighbours", 2.5, r"must be a whole number \(given: 2.5\)"),
+        ("lsi", "solver", 3, r"must be one of 'exact', 'matlab', 'sklearn' \(given: 3\)"),
+        ("lsi", "neighbours", 0, "must be at least 1, not 0"),
+        ("lsi", "overlap", float("nan"), "must be a finite number"),
+        ("rsi", "gamma_min_deg", "x", "must be a number"),
+        ("geometric", "fov_tolerance", 2.0, "must be 0…0.3, not 2.0"),
+        ("rsi", "limiting_magnitude", "x", r"must be a number \(given: 'x'\)"),
     ],
 )
 def test_an_option_that_the_algorithm_does_not_have_is_named(algorithm, option, value, said):
     with pytest.raises(EmulatorError, match=said):
-        StarIdentifierSetup(algorithm, DEFAULT_CAMERA, 1.0, ((option, value),)).make(None)
+        load_profile(
+            "ideal", [f"run.algorithm={algorithm}", f"identifier.{option}={json.dumps(value).lower()}"]
+        )
 
 
 def test_frames_are_solved_while_another_index_is_built_and_then_the_new_limit_holds():

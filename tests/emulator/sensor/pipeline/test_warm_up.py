@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.process
+
 SCRIPT = """
 import sys
 from dataclasses import replace
@@ -14,13 +16,14 @@ import numpy as np
 from starhil.emulator.profile.pipeline_setup import pipeline_setup
 from starhil.emulator.sensor.pipeline.pipeline import make_pipeline
 from starhil.emulator.profile import load_profile
-from numba.core.registry import CPUDispatcher
+from numba import njit
+Kernel = type(njit(lambda: None))
 
 def kernels():
     modules = [module for name, module in sys.modules.items() if name.partition(".")[0] in ("starid", "starhil")]
     return {
         f"{item.py_func.__module__}.{item.__name__}{signature}"
-        for module in modules for item in list(vars(module).values()) if isinstance(item, CPUDispatcher)
+        for module in modules for item in list(vars(module).values()) if isinstance(item, Kernel)
         for signature in item.signatures
     }
 

@@ -8,14 +8,16 @@ from pathlib import Path
 import erfa
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.sensor.sky.ephemeris import Observer
 from starhil.emulator.sensor.sky.light import through_baffle
 from starhil.emulator.sensor.sky.objects import SkyObjects, icrs_vector
+from starhil.emulator.sensor.sky.tables import SKY
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.truth.orbit import KeplerOrbit
+from starhil.protocol.files.validation import problems
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
@@ -361,16 +363,25 @@ def test_a_body_that_a_fault_places_looks_as_in_the_profile(bodies):
 @pytest.mark.parametrize(
     ("values", "said"),
     [
-        ({"bodies": "all"}, "'typed' or 'ephemeris'"),
-        ({"aberration": 1}, "true or false"),
-        ({"bodies": "ephemeris", "sun": {"colour": 1}}, "unknown key 'colour'"),
-        ({"bodies": "ephemeris", "moon": {"magnitude": -1.0}}, "follows from the date"),
-        ({"bodies": "ephemeris", "sun": {"exclusion_deg": 200.0}}, "exclusion_deg"),
-        ({"sun": {"ra_deg": 20.0}}, "'dec_deg' is missing"),
-        ({"sun": {"colour": 1}}, "unknown key 'colour'"),
-        ({"earth": {"ra_deg": 0.0, "dec_deg": 0.0, "sun_ra_deg": 1.0}}, "belong together"),
+        ({"bodies": "all"}, "bodies: must be one of 'typed', 'ephemeris' (given: 'all')"),
+        ({"aberration": 1}, "aberration: must be true or false (given: 1)"),
+        ({"date": "soon"}, "date: must be a date from 1970 to 2100"),
+        ({"bodies": "ephemeris", "sun": {"colour": 1}}, "sun.colour: unknown key"),
+        (
+            {"bodies": "ephemeris", "moon": {"magnitude": -1.0}},
+            "as a whole: moon.magnitude follows from the date",
+        ),
+        ({"bodies": "ephemeris", "sun": {"exclusion_deg": 200.0}}, "sun.exclusion_deg: must be at most 180"),
+        ({"sun": {"ra_deg": 20.0}}, "sun: dec_deg is missing; a direction is ra_deg and dec_deg"),
+        ({"sun": {"colour": 1}}, "sun.colour: unknown key; known: dec_deg"),
+        (
+            {"earth": {"ra_deg": 0.0, "dec_deg": 0.0, "sun_ra_deg": 1.0}},
+            "earth: sun_ra_deg and sun_dec_deg belong",
+        ),
     ],
 )
 def test_a_bad_sky_is_named(values, said):
-    with pytest.raises(EmulatorError, match=said):
-        Sky(values)
+    with pytest.raises(ValidationError) as caught:
+        SKY.model_validate(values)
+    (problem,) = map(str, problems(caught.value, SKY, values))
+    assert problem.startswith(said)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
-from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.sensor.sky.light import AreaPainter
 from starhil.emulator.sensor.sky.light_grid import Backdrop
@@ -18,6 +18,8 @@ from starhil.emulator.sensor.sky.objects import (
     SunGlare,
     icrs_vector,
 )
+from starhil.emulator.sensor.sky.tables import OPTICAL_FAULT
+from starhil.protocol.files.validation import problems
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
@@ -255,45 +257,59 @@ def test_plain_values_make_the_same_objects() -> None:
 @pytest.mark.parametrize(
     ("values", "text"),
     [
-        ({"comet": {}}, "unknown key 'comet'"),
-        ({"moon": {"ra_deg": 1.0}}, "sky moon: key 'dec_deg' is missing"),
-        ({"moon": {"ra_deg": 1.0, "dec_deg": 95.0}}, "dec_deg: must be a number -90…90, not 95.0"),
-        ({"moon": 3}, "sky moon: must be a table, not 3"),
-        ({"planets": 4}, "sky planets: must be a list of tables"),
-        ({"false_stars": 1.5}, "false_stars: must be a whole number 0…100000, not 1.5"),
-        ({"false_stars": -1}, "false_stars: must be a whole number 0…100000, not -1"),
-        ({"false_star_magnitudes": [5, 1]}, "put the brighter one first"),
-        ({"false_star_magnitudes": "bright"}, "must be two numbers"),
-        ({"blocked_share": 1.5}, "share: must be a number 0…1, not 1.5"),
-        ({"obstructions": [{"polygon_px": [1, 2]}]}, "polygon_px"),
+        ({"comet": {}}, "comet: unknown key; known: blank"),
+        ({"blocked_shar": 1.0}, "blocked_shar: unknown key; did you mean blocked_share?"),
+        ({"moon": {"ra_deg": 1.0}}, "moon.dec_deg: missing"),
+        ({"moon": {"ra_deg": 1.0, "dec_deg": 95.0}}, "moon.dec_deg: must be at most 90 (given: 95.0)"),
         (
-            {"obstructions": [{"polygon_px": [["a", "b"], [1, 2], [3, 4]]}]},
-            "polygon_px: must be a number -100000…100000, not 'a'",
+            {"moon": {"ra_deg": 1.0, "dec_deg": 9.0, "colour": 1}},
+            "moon.colour: unknown key; known: bright_limb",
+        ),
+        ({"moon": 3}, "moon: must be a table (given: 3)"),
+        ({"planets": 4}, "planets: must be a list (given: 4)"),
+        ({"planets": [{"ra_deg": 1.0, "dec_deg": 2.0}]}, "planets.0.magnitude: missing"),
+        ({"false_stars": 1.5}, "false_stars: must be a whole number (given: 1.5)"),
+        ({"false_stars": -1}, "false_stars: must be at least 0 (given: -1)"),
+        ({"false_star_magnitudes": [5, 1]}, "false_star_magnitudes: 5 to 1; put the brighter one first"),
+        ({"false_star_magnitudes": "bright"}, "false_star_magnitudes: must be a list (given: 'bright')"),
+        ({"false_star_magnitudes": [1]}, "false_star_magnitudes: must have at least 2 items, not 1"),
+        ({"blocked_share": 1.5}, "blocked_share: must be at most 1 (given: 1.5)"),
+        ({"blocked_share": ""}, "blocked_share: must be a number (given: '')"),
+        ({"blank": "no"}, "blank: must be true or false (given: 'no')"),
+        (
+            {"obstructions": [{"polygon_px": [1, [2, 3]]}]},
+            "obstructions.0.polygon_px.0: must be a list (given: 1)",
+        ),
+        ({"moon": {"ra_deg": 10**400, "dec_deg": 0.0}}, "moon.ra_deg: must be a"),
+        (
+            {"moon": {"ra_deg": float("inf"), "dec_deg": 0.0}},
+            "moon.ra_deg: must be a finite number (given: inf)",
         ),
         (
-            {"obstructions": [{"polygon_px": [[True, 0], [1, 2], [3, 4]]}]},
-            "polygon_px: must be a number -100000…100000, not True",
+            {"earth": {"ra_deg": 0.0, "dec_deg": 0.0, "sun_ra_deg": 1.0}},
+            "earth: sun_ra_deg and sun_dec_deg belong together; give both or neither",
         ),
-        (
-            {"obstructions": [{"polygon_px": [[float("nan"), 0], [1, 2], [3, 4]]}]},
-            "polygon_px: must be a number -100000…100000, not nan",
-        ),
-        (
-            {"obstructions": [{"polygon_px": [[1e200, 0], [1, 2], [3, 4]]}]},
-            "polygon_px: must be a number -100000…100000, not 1e+200",
-        ),
-        ({"moon": {"ra_deg": 10**400, "dec_deg": 0.0}}, "ra_deg: must be a number -360…360, not 1000"),
-        ({"moon": {"ra_deg": float("inf"), "dec_deg": 0.0}}, "ra_deg: must be a number -360…360, not inf"),
-        ({"blocked_share": ""}, "share: must be a number 0…1, not ''"),
-        ({"blank": "no"}, "blank: must be true or false, not 'no'"),
         (
             {"planets": [{"ra_deg": 1.0, "dec_deg": 2.0, "magnitude": 1.0, "name": 3}]},
-            "name: must be a string, not 3",
+            "planets.0.name: must be a text (given: 3)",
+        ),
+        *(
+            (
+                {"obstructions": [{"polygon_px": [[1, 2], [3, corner]]}]},
+                f"obstructions.0.polygon_px.1.1: {said}",
+            )
+            for corner, said in (
+                ("a", "must be a number (given: 'a')"),
+                (True, "must be a number (given: True)"),
+                (float("nan"), "must be a finite number (given: nan)"),
+                (1e200, "must be at most 100000 (given: 1e+200)"),
+            )
         ),
     ],
 )
 def test_bad_objects_are_rejected_in_one_line(values: dict[str, object], text: str) -> None:
-    with pytest.raises(EmulatorError) as caught:
-        SkyObjects.from_dict(values)
-    assert text in str(caught.value)
-    assert "\n" not in str(caught.value)
+    with pytest.raises(ValidationError) as caught:
+        OPTICAL_FAULT.model_validate(values)
+    (problem,) = map(str, problems(caught.value, OPTICAL_FAULT, values))
+    assert problem.startswith(text) or f": {text}" in problem
+    assert "\n" not in problem

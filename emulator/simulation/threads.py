@@ -1,0 +1,58 @@
+"""Threads beside the event loop, for computations of any length that a run must not wait for."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import threading
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from functools import partial
+from typing import Any, Final, ParamSpec, TypeVar
+
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
+
+SWITCH_S: Final = 0.0002
+"""Time for which a thread may keep the interpreter while another waits for it, seconds. The event loop waits for it several
+times in an exchange; Python's default is 0.005."""
+
+
+class _AbandonedThreads(Executor):
+    """One thread for each call, which the end of the process does not wait for; those of asyncio's own executor it does."""
+
+    def submit(
+        self, function: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
+    ) -> Future[Result]:
+        """Begin a call."""
+        future: Future[Result] = Future()
+
+        def run() -> None:
+            if not future.set_running_or_notify_cancel():
+                return
+            try:
+                result = function(*args, **kwargs)
+            except BaseException as error:  # noqa: BLE001 (it belongs to whoever waits)
+                future.set_exception(error)
+            else:
+                future.set_result(result)
+
+        threading.Thread(target=run, daemon=True).start()
+        return future
+
+
+_THREADS: Final = _AbandonedThreads()
+
+
+async def in_thread(
+    function: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs
+) -> Result:
+    """Call a function without effects, which is abandoned if the run ends first."""
+    call: Any = partial(function, *args, **kwargs)
+    result: Result = await asyncio.get_running_loop().run_in_executor(_THREADS, call)
+    return result
+
+
+def share_interpreter() -> None:
+    """Let the event loop have the interpreter soon while threads compute."""
+    sys.setswitchinterval(SWITCH_S)

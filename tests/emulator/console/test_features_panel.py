@@ -1,0 +1,60 @@
+"""The console's panel of features in a real browser, with the thesis's recursive algorithm on a turning sensor."""
+
+import pytest
+
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.private_can_bus import private_can_bus
+from tests.emulator.console.test_browser import CHROMIUM, browser, page, send  # noqa: F401 (fixtures)
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.process,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: as root, apt-get install chromium"),
+]
+
+SETTINGS = (
+    "run.algorithm=rsi", "truth.kind=rate", "truth.attitude.ra_deg=83.8", "truth.attitude.dec_deg=-1.2",
+    "truth.attitude.roll_deg=30", "truth.rate_deg_s=[0.0, 0.3, 0.0]", "sky.false_stars=6", "parameters.update_rate=2",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def emulator():
+    with private_can_bus() as bus:
+        command = emulator_command(
+            profile="ideal", serial="off", can=bus, seed=1, settings=list(SETTINGS), extra=["--view", "auto"]
+        )
+        with EmulatorProcess(command) as process:
+            yield process
+
+
+def test_features_region_and_removed_detections_are_shown(page):  # noqa: F811
+    assert page.locator("#features").is_hidden()
+    send(page, "set_mode", mode="lost_in_space")
+    page.wait_for_function(
+        "() => { const known = starhil.store.image && starhil.store.image.head.features;"
+        " return known && known.search === 'rsi' && known.removed.length >= 3; }"
+    )
+    page.click("#live")  # nothing changes any more
+    shown = page.evaluate("() => starhil.store.image.head.features")
+    page.wait_for_function(
+        "text => document.querySelector('#features p').textContent.includes(text)",
+        arg=f"{len(shown['removed'])} removed",
+    )
+    widths = page.evaluate(
+        "() => [...document.querySelectorAll('#features i')].map((bar) => parseFloat(bar.style.width))"
+    )
+    pairs = [value for pair in zip(shown["observed"], shown["of_cell"], strict=True) for value in pair]
+    assert widths == pytest.approx([min(max(value, 0.0), 100.0) for value in pairs], abs=0.01)
+    assert "RSI, 2.0°" in page.locator("#features p").text_content()
+    assert shown["region_deg"] == pytest.approx(2.0, abs=0.1)
+    crossed = page.evaluate(
+        """() => {
+          const { sky } = starhil, { head } = sky.shown, ratio = window.devicePixelRatio || 1;
+          return head.features.removed.map((row) => {
+            const [x, y] = sky.place(head.detections[row][0], head.detections[row][1]);
+            return sky.overlay.getContext("2d").getImageData(Math.round(x * ratio), Math.round(y * ratio), 1, 1).data[3];
+          });
+        }"""
+    )
+    assert min(crossed) > 0  # ink in the middle of each, where a circle or square has none
