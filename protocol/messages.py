@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum, IntEnum, StrEnum
+from enum import Enum, Flag, IntEnum, StrEnum
 from typing import Final, Protocol, TypeVar
 
 Arriving_contra = TypeVar("Arriving_contra", contravariant=True)
@@ -89,6 +89,16 @@ class FaultKind(Enum):
     """A segmented message longer than the receiver accepts, or too many incomplete messages."""
 
 
+class Flaw(Flag):
+    """Errors in a message that is sent with them on purpose, and is well-formed otherwise."""
+
+    NONE = 0
+    CHECK = 1
+    """A wrong check, on a serial line that has one."""
+    SEQUENCE = 2
+    """A wrong sequence number in the header, or a wrong segment counter on CAN."""
+
+
 @dataclass(frozen=True, slots=True)
 class Request:
     """A telecommand with its parameters, or a request for telemetry."""
@@ -139,6 +149,8 @@ class Reply:
     """Time since the device started, if the header carries `ticks`."""
     time_ns: int = 0
     """Time of the device's clock since the unit's epoch, if the header carries `time`."""
+    flaw: Flaw = Flaw.NONE
+    """Errors with which it is sent (set on the device side)."""
 
     @classmethod
     def echo(cls, request: Request) -> Reply:

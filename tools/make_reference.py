@@ -37,6 +37,8 @@ UNITS: Final = {
     "anomaly_s": "1/s",
     "baud": "Bd",
     "cosmic_rays_s": "1/s",
+    "drift_ppm": "ppm",
+    "drift_ppm_c": "ppm/°C",
     "epoch": "Julian year",
     "false_star_magnitudes": "V",
     "height": "px",
@@ -343,6 +345,8 @@ def identifier() -> str:
 
 def faults() -> str:
     """Keys of the tables of a `fault` request, except optical faults, whose keys are those of `[sky]`."""
+    from starhil.emulator.device.clock_errors import ClockFault
+    from starhil.emulator.device.telemetry_faults import TelemetryFault
     from starhil.emulator.run.faults import EFFECTS, DeviceFault, WireFault
     from starhil.protocol.unit import load_unit
 
@@ -352,7 +356,9 @@ def faults() -> str:
         allowed = ", ".join(f"`{name}`" for name in enums[effect.enum].values) if effect.enum else row[2]
         rows.append((row[0], row[1], allowed, row[3], row[4]))
     return (
-        f"### `device`\n\n{table(rows)}\n\n### `serial`, `can`\n\n"
+        f"### `device`\n\n{table(rows)}\n\n### `clock`\n\n{table(model_rows(ClockFault))}\n\n### `telemetry`\n\n"
+        "A table, or a list of tables. [FDIR tests](fdir.md) has examples; on CANopen, PDOs and SDO answers are affected.\n\n"
+        f"{table(model_rows(TelemetryFault))}\n\n### `serial`, `can`\n\n"
         f"`can` is what the device sends on the CAN bus, CANopen included.\n\n{table(model_rows(WireFault))}"
     )
 

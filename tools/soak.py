@@ -347,7 +347,8 @@ class Page:
     async def _ask(self, request: dict[str, Any]) -> None:
         await self._pages.send_str(json.dumps({**request, "id": 1}))
         async for message in self._pages:  # ends if the console closes
-            if '"type": "answer"' in str(message.data)[:60]:
+            await self._pages.send_str('{"do": "received"}')
+            if b'"type": "answer"' in message.data:
                 return
 
 

@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import time
-from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starhil.emulator.cli.options import ProfileArgument
+from starhil.emulator.cli.options import ProfileArgument, names_of
 from starhil.emulator.cli.output import report_slow_start
 from starid.cli.options import AsJson
+
+if TYPE_CHECKING:
+    from starhil.emulator.profile import Profile
+
+log = logging.getLogger("starhil.run")
 
 group = typer.Typer(
     help="Show, fill or clear the cache of star catalogues, indices, databases and machine code of kernels."
@@ -51,41 +57,63 @@ def info(as_json: AsJson = False) -> None:
 @group.command("warm")
 def warm(
     profile: ProfileArgument = None,
+    unit: Annotated[
+        str | None,
+        typer.Option(
+            help="Unit: a name or a folder; default: the profile's.", autocompletion=names_of("unit")
+        ),
+    ] = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(help="Scenario: a name or a TOML file.", autocompletion=names_of("scenario")),
+    ] = None,
 ) -> None:
     """Compile the kernels and build the star index, as the first start of a profile does.
 
-    Progress is shown on stderr. Kernels are the same for all profiles; the star index depends on the camera and the
-    parameters.
+    Without a profile, a unit or a scenario: for all bundled profiles, and for all bundled units on the default profile.
+    Progress is shown on stderr.
     """
-    from starhil.emulator.device.device import adopt_camera, profile_defaults
-    from starhil.emulator.device.parameters import Parameters
+    from starhil.emulator.control.scenario import load_scenario
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
-    from starhil.emulator.profile.pipeline_setup import pipeline_setup
-    from starhil.emulator.sensor.pipeline.client import WorkerClient
-    from starhil.emulator.sensor.pipeline.messages import IndexRequest, SolverSettings, camera_constants
-    from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
-    from starhil.protocol.unit import load_unit
+    from starhil.emulator.run import Run
+    from starhil.protocol.files.bundled import bundled, bundled_units
     from starid.storage.cache import cache_dir, kernels_written_since
 
     begin_s = time.time()
-    loaded = load_profile(profile or DEFAULT_PROFILE)
-    icd = load_unit(loaded.unit_source)
-    parameters = Parameters(icd, profile_defaults(loaded, icd))
-    setup = pipeline_setup(loaded)
-    setup = replace(setup, previews=True, sky={"bodies": "ephemeris"})  # these have kernels of their own
+    skies = [] if scenario is None else load_scenario(scenario).skies
+    targets = [(profile or DEFAULT_PROFILE, unit)]
+    if profile is unit is scenario is None:
+        targets += [(name, None) for name in bundled("profile") if name != DEFAULT_PROFILE]
+        targets += [(DEFAULT_PROFILE, name) for name in bundled_units()]
+    fixed = [
+        "run.clock=stepped",
+        "run.worker=process",
+        "links.serial.port=off",
+        "links.can.channel=off",
+        "links.canopen.node=0",
+    ]
+    wanted = [
+        load_profile(name, [*fixed, "run.state_dir=", *([] if of is None else [f"unit={of}"])])
+        for name, of in targets
+    ]
+    by_date = wanted[0].model_copy(update={"sky": {"bodies": "ephemeris"}})  # which has kernels of its own
 
-    async def start() -> None:
-        imager = WorkerClient(setup, WorkerProcess())
+    async def start(loaded: Profile) -> None:
+        run = Run([loaded], previews=True)
         progress = asyncio.create_task(report_slow_start())
         try:
-            adopt_camera(parameters, loaded, camera_constants((await imager.start()).camera))
-            imager.prepare(IndexRequest(SolverSettings.of(parameters)))
-            await imager.settle()
+            await run.open()
+            run.heads[0].foreseen += skies
+            run.begin()
+            await run.ready()
         finally:
             progress.cancel()
-            await imager.close()
+            await run.close()
 
-    asyncio.run(start())
+    starts = [*(each for each in wanted if each.sky or len(wanted) > 1), by_date]
+    for number, each in enumerate(starts, 1):
+        log.info("%d of %d: %s, unit %s", number, len(starts), each.name, each.unit_source)
+        asyncio.run(start(each))
     print(
         f"{kernels_written_since(begin_s)} kernels compiled in {time.time() - begin_s:.1f} s, in {cache_dir()}"
     )

@@ -178,6 +178,14 @@ class AroundOptions:
             "command. It is the same in the next run, so that such pages reconnect.",
         ),
     ] = None
+    command_token: Annotated[
+        str | None,
+        typer.Option(
+            envvar="STARHIL_COMMAND_TOKEN",
+            help="Token of the console's address (`view`), the same in the next run, so that its pages reconnect; default: "
+            "a random one.",
+        ),
+    ] = None
     record: Annotated[
         list[Path] | None,
         typer.Option(
@@ -193,11 +201,15 @@ class AroundOptions:
         from starhil.emulator.control.token import check_token
         from starhil.emulator.launch import ConsoleOptions, RunOptions
 
-        for option, token in (("--control-token", self.control_token), ("--view-token", self.view_token)):
+        of_console = {"--view-token": self.view_token, "--command-token": self.command_token}
+        for option, token in {"--control-token": self.control_token, **of_console}.items():
             if token is not None:
                 check_token(option, token)
-        if self.view_token is not None and self.view == "off":
-            raise EmulatorError("--view-token: needs --view")
+        for option, token in of_console.items():
+            if token is not None and self.view == "off":
+                raise EmulatorError(f"{option}: needs --view")
+        if self.view_token is not None and self.view_token == self.command_token:
+            raise EmulatorError("--view-token: must differ from --command-token")
         records = _by_format(self.record or ())
         folder = records.pop("", None)
         files = tuple(records.values())
@@ -215,7 +227,9 @@ class AroundOptions:
             record=folder,
             console=None
             if self.view == "off" and not files
-            else ConsoleOptions(ConsoleClient, self.view, self.view_token or "", files),
+            else ConsoleOptions(
+                ConsoleClient, self.view, self.view_token or "", self.command_token or "", files
+            ),
         )
 
 

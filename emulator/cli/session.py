@@ -28,6 +28,12 @@ def command(
         Path | None, typer.Option(help="Folder for logs, samples and images; default out/session/NAME.")
     ] = None,
     truth: Annotated[Path | None, typer.Option(help="Truth log of the emulator (run --truth-log).")] = None,
+    control: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", help="Control channel of an emulator that runs already, from its ready line."
+        ),
+    ] = None,
     baud: Annotated[int, typer.Option(help="Bit rate of a real serial line.")] = 115200,
     keep_going: Annotated[bool, typer.Option("--keep-going", help="Continue after a failed step.")] = False,
     as_json: AsJson = False,
@@ -60,6 +66,7 @@ def command(
         log,
         bench.junit,
         truth,
+        control,
         keep_going,
         quiet=as_json,
         view=bench.view,

@@ -5,16 +5,18 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import secrets
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from functools import partial
 from typing import Any, Final
 
 from starhil.emulator.console.describe import describe, load_bright_stars
-from starhil.emulator.console.history import History, frame_message, json_row
-from starhil.emulator.console.obc import POLL_S, ConsoleObc, Exchange, ObcConnection
+from starhil.emulator.console.events import EventLog
+from starhil.emulator.console.history import History, Image, image_of
+from starhil.emulator.console.obc import POLL_S, ConsoleObc, ObcConnection, exchange_content
 from starhil.emulator.console.obc_link import obc_bus
-from starhil.emulator.console.pointing import pointing_request
+from starhil.emulator.console.pointing import is_number, pointing_request
 from starhil.emulator.console.reported_runs import ReportedRuns
 from starhil.emulator.console.stepping import StepRunner
 from starhil.emulator.console.trace import RequestEncoder, WireTrace
@@ -26,8 +28,10 @@ from starhil.emulator.links.table import LINKS
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.emulator.run import Run
 from starhil.emulator.run.head import Head
+from starhil.emulator.run.tape import LONGEST_NOTE, Note
 from starhil.emulator.simulation.guard import log_internal_error, one_line
 from starhil.emulator.simulation.threads import in_thread
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.errors import StaridError
@@ -43,7 +47,10 @@ STATUS_S: Final = 0.5
 CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "clear_faults", "scenario"})
 """Requests on the control channel that a page may make."""
 
-READ_ONLY_REQUESTS: Final = frozenset({"subscribe", "encode", "parameters"})
+RUN_ID: Final = secrets.token_hex(8)
+"""Tells a page that connects again whether it is still the same run."""
+
+READ_ONLY_REQUESTS: Final = frozenset({"subscribe", "encode", "parameters", "message"})
 """Requests that a page for viewing only may make."""
 
 
@@ -51,15 +58,24 @@ class Console:
     """Server side of the pages of a head."""
 
     def __init__(
-        self, run: Run, head: Head, client: ObcConnection, stepping: StepRunner, runs: ReportedRuns
+        self,
+        run: Run,
+        head: Head,
+        client: ObcConnection,
+        logs: Sequence[EventLog],
+        stepping: StepRunner,
+        runs: ReportedRuns,
     ) -> None:
         self._run = run
         self._head = head
         device = head.device
         self.obc = ConsoleObc(client, device.icd)
         self.history = History()
+        self._logs = logs
+        self.events = logs[head.number - 1]
         self.runs = runs
         runs.changed.connect(self._broadcast)
+        objects = DeviceDictionary(device.icd) if "canopen" in {*head.links, obc_bus(device.icd)} else None
         self.trace = WireTrace(
             device.icd,
             head.traffic,
@@ -67,12 +83,13 @@ class Console:
             lambda: next(
                 (link.transport.description for link in head.links.values() if link.bus == "can"), ""
             ),
+            objects,
         )
         self.stepping = stepping
-        self._requests = RequestEncoder(device.icd)
+        self._requests = RequestEncoder(device.icd, objects)
         self._address = LINKS[obc_bus(device.icd)].address
-        self._last_frame = b""
-        """The latest message with an image; empty before the first."""
+        self._last_image: Image | None = None
+        """The latest image; None before the first."""
         self._unresponsive_since_s: float | None = None
         """Simulation time since which the device is unresponsive, seconds; None if it is not."""
         self._hello: dict[str, Any] = {}
@@ -92,6 +109,8 @@ class Console:
             "send": self._send,
             "read": self._read,
             "clear_session": self._clear_session,
+            "note": self._note,
+            "message": self._message,
         }
 
     def start(self) -> None:
@@ -100,6 +119,7 @@ class Console:
         device.signals.frame_published.connect(self._frame_published)
         device.signals.mode_changed.connect(self._mode_changed)
         device.signals.faults_changed.connect(self._faults_changed)
+        self.events.added.connect(self._event_added)
         self._faults_changed({})
         self._record_mode(device.modes.mode)
         profile = self._head.profile
@@ -110,7 +130,7 @@ class Console:
 
     async def close(self) -> None:
         """Stop listening."""
-        self.trace.listen(wanted=False)
+        self.trace.close()
         tasks = [*self._tasks, *([self._stars] if self._stars is not None else [])]
         for task in tasks:
             task.cancel()
@@ -135,21 +155,23 @@ class Console:
     def join(self, viewer: Viewer) -> None:
         """Add a page."""
         self.viewers.add(viewer)
+        self.events.add("page", f"a page was opened; {len(self.viewers)} open")
         self._viewers_changed()
 
     def leave(self, viewer: Viewer) -> None:
         """Remove a page."""
-        self.viewers.discard(viewer)
+        if viewer in self.viewers:
+            self.viewers.discard(viewer)
+            self.events.add("page", f"a page was closed or lost; {len(self.viewers)} open")
         self._viewers_changed()
 
     def _viewers_changed(self) -> None:
-        """Make previews and record traffic only while a page is open."""
+        """Make previews only while a page shows them."""
         watchers = self._head.imager.watchers
         if any(viewer.frames for viewer in self.viewers):
             watchers.add(self)
         else:
             watchers.discard(self)
-        self.trace.listen(wanted=bool(self.viewers))
         if any(viewer.rows for viewer in self.viewers):
             self._rows_wanted.set()
         else:
@@ -164,8 +186,11 @@ class Console:
         if not self._hello:
             stars = await self._stars if self._stars is not None else {}
             self._hello = describe(self._run, self._head) | stars
-        viewer.send(json.dumps({"type": "hello", "view_only": not viewer.commands, **self._hello}))
+        viewer.send(
+            json.dumps({"type": "hello", "view_only": not viewer.commands, "run_id": RUN_ID, **self._hello})
+        )
         viewer.send(json.dumps({"type": "reasons", "reasons": self.history.reasons}))
+        viewer.send(json.dumps({"type": "sent", "items": self.obc.sent(), "all": True}))
         for message in self.runs.messages():
             viewer.send(message)
 
@@ -186,16 +211,19 @@ class Console:
     # --- listeners ---
 
     def _frame_published(self, measurement: Measurement) -> None:
+        number = self.history.end
         row = self._with_reasons(lambda: self.history.add(measurement))
-        if measurement.result.preview is None and not any(viewer.frames for viewer in self.viewers):
-            return
-        data = frame_message(measurement, row)
-        if measurement.result.preview is not None:
-            self._last_frame = data
-        numbers = json.dumps({"type": "row", "row": json_row(row)})
+        image = image_of(measurement, number, row)
+        self._last_image = image or self._last_image
         for viewer in self.viewers:
             if viewer.frames:
-                viewer.send_frame(data, numbers)
+                viewer.wake()
+                if image is not None:
+                    viewer.send_image(image)
+
+    def _event_added(self, _event: object) -> None:
+        for viewer in self.viewers:
+            viewer.wake()
 
     def _with_reasons(self, add: Callable[[], list[float]]) -> list[float]:
         """Add a row to the history and return it; its reason, if new, is sent to the pages."""
@@ -213,8 +241,9 @@ class Console:
         if mode.makes_frames:
             return
         unix_s = self._head.device.time.unix_ns() / NANOSECONDS
-        row = self._with_reasons(lambda: self.history.add_mode(mode, self._now_s(), unix_s))
-        self._broadcast({"type": "row", "row": json_row(row)}, lambda viewer: viewer.frames)
+        self._with_reasons(lambda: self.history.add_mode(mode, self._now_s(), unix_s))
+        for viewer in self.viewers:
+            viewer.wake()
 
     def _faults_changed(self, _request: dict[str, Any]) -> None:
         if not self._head.device.unresponsive:
@@ -227,25 +256,17 @@ class Console:
         return self._run.clock.now_ns() / NANOSECONDS
 
     async def _deliver_trace(self) -> None:
+        """Decode new traffic while a page shows it, some items at a time."""
         await asyncio.sleep(TURN_S)
         if not any(viewer.wire for viewer in self.viewers):
-            self.trace.discard()
             return
-        lines, left_out = self.trace.drain()
-        if not lines:
-            return
-        texts: dict[int, str] = {}
-        for viewer in self.viewers:
-            if not viewer.wire:
-                continue
-            viewer.wire_left_out += left_out
-            if viewer.behind:
-                viewer.wire_left_out += len(lines)
-                continue
-            missed, viewer.wire_left_out, viewer.wire_end = viewer.wire_left_out, 0, lines[-1]["n"] + 1
-            if missed not in texts:
-                texts[missed] = json.dumps({"type": "wire", "lines": lines, "left_out": missed})
-            viewer.send(texts[missed])
+        before = self.trace.end
+        while self.trace.decode():
+            await asyncio.sleep(0)
+        if self.trace.end != before:
+            for viewer in self.viewers:
+                if viewer.wire:
+                    viewer.wake()
 
     async def _report_status(self) -> None:
         await self._status_due.wait()
@@ -260,6 +281,9 @@ class Console:
                 "stepping": self.stepping.speed,
                 "session_steps": self.obc.steps,
                 "heard": self._heard(),
+                "heads": [
+                    _head_state(head, log) for head, log in zip(self._run.heads, self._logs, strict=True)
+                ],
                 "wall_s": time.time(),
             },
             state="status",
@@ -317,14 +341,15 @@ class Console:
         rows = request.get("rows") or []
         if not isinstance(rows, list) or not all(isinstance(name, str) for name in rows):
             raise EmulatorError("rows: must be a list of names of telemetry rows")
-        begins, viewer.frames = not viewer.frames, bool(request.get("frames"))
-        if begins and viewer.frames and self._last_frame:
-            viewer.send_frame(self._last_frame)
-        begins, viewer.wire = not viewer.wire, bool(request.get("wire"))
-        if begins and viewer.wire:
-            lines = self.trace.recent(viewer.wire_end)
-            viewer.wire_end = lines[-1]["n"] + 1 if lines else viewer.wire_end
-            viewer.send(json.dumps({"type": "wire", "lines": lines, "left_out": 0}))
+        frames, wire = bool(request.get("frames")), bool(request.get("wire"))
+        if wire and not viewer.wire:
+            while self.trace.decode():
+                await asyncio.sleep(0)
+        if frames and not viewer.frames and self._last_image is not None:
+            viewer.send_image(self._last_image)
+        viewer.subscribe(
+            frames=frames, wire=wire, history=_count(request, "history"), events=_count(request, "events")
+        )
         known = frozenset(row.name for row in self._head.device.icd.readable)
         viewer.rows = known.intersection(rows)
         self._viewers_changed()
@@ -354,8 +379,13 @@ class Console:
 
     async def _encode(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         row, data, _, problem = self.obc.encode(str(request.get("row")), _table(request, "values"))
-        address = int(self._head.device.parameters[self._address]) if self._address else 0
-        return {"problem": problem, **self._requests.encode(row, data, CONSOLE_ADDRESS, address)}
+        parameters = self._head.device.parameters
+        address = int(parameters[self._address]) if self._address else 0
+        encoded = self._requests.encode(row, data, CONSOLE_ADDRESS, address)
+        obc_address, as_obc = int(parameters["host_address"]), []
+        if self._head.icd.link.can is not None:
+            as_obc = self._requests.encode(row, data, obc_address, address)["cansend"]
+        return {"problem": problem, "obc_address": obc_address, "as_obc": as_obc, **encoded}
 
     async def _parameters(self, _viewer: Viewer, _request: dict[str, Any]) -> dict[str, Any]:
         """Return the present values of the parameters by name, as numbers."""
@@ -364,19 +394,76 @@ class Console:
 
     async def _send(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         exchange = await self.obc.send(str(request.get("row")), _table(request, "values"))
+        self._report_sent()
         return exchange_content(exchange)
 
     async def _read(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         exchange, values = await self.obc.read(str(request.get("row")))
+        self._report_sent()
         return {"values": values, **exchange_content(exchange)}
 
     async def _clear_session(self, _viewer: Viewer, _request: dict[str, Any]) -> dict[str, Any]:
         self.obc.clear()
+        self._broadcast({"type": "sent", "items": [], "all": True})
         return {}
+
+    def _report_sent(self) -> None:
+        """Send the last transaction to all pages."""
+        self._broadcast({"type": "sent", "items": self.obc.sent(1), "all": False})
+
+    async def _note(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        text, at_s = str(request.get("text", "")).strip()[:LONGEST_NOTE], request.get("at_s")
+        if not text:
+            raise EmulatorError("text: a note must not be empty")
+        if at_s is not None and not (is_number(at_s) and 0.0 <= at_s <= self._now_s()):
+            raise EmulatorError("at_s: must be a simulation time that has been")
+        self._run.wiring.latch()
+        self._run.wiring.enter(Note, text=text)
+        return {"n": self.events.note(text, at_s).n}
+
+    async def recording(self) -> bytes:
+        """Return numbers, events and traffic of the last hour as an MCAP file.
+
+        Raises
+        ------
+        EmulatorError
+            The package `mcap` is not installed.
+        """
+        try:
+            from starhil.emulator.console.mcap import recorded
+        except ImportError:
+            raise EmulatorError("record: needs `mcap`; pip install 'starhil[mcap]'") from None
+        rows = self.history.rows(range(self.history.start, self.history.end))
+        events, items, reasons = self.events.events(), self.trace.items(), list(self.history.reasons)
+        return await in_thread(recorded, self._head, rows, reasons, events, items)
+
+    async def _message(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        """Return a message of the trace, with its fields and what sends it again."""
+        return self.trace.message(_count(request, "n"))
+
+
+def _head_state(head: Head, log: EventLog) -> dict[str, Any]:
+    """Return mode, validity and faults of a head."""
+    levels = head.faults.describe()
+    return {
+        "head": head.number,
+        "mode": head.device.modes.mode.value,
+        "valid": log.valid,
+        "faults": [
+            f"{level}: {', '.join(content) if isinstance(content, dict) else len(content)}"
+            for level, content in levels.items()
+        ],
+    }
 
 
 def _shows(row: str, viewer: Viewer) -> bool:
     return row in viewer.rows
+
+
+def _count(request: dict[str, Any], key: str) -> int:
+    """Return a number of items that a page has; 0 if it is missing or wrong."""
+    value = request.get(key)
+    return value if isinstance(value, int) else 0
 
 
 def _table(request: dict[str, Any], key: str) -> dict[str, Any]:
@@ -385,14 +472,3 @@ def _table(request: dict[str, Any], key: str) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise EmulatorError(f"{key}: must be an object")
     return value
-
-
-def exchange_content(exchange: Exchange) -> dict[str, Any]:
-    """Return the outcome of a request as JSON data."""
-    latency = None if exchange.latency_s is None else round(exchange.latency_s * 1e3, 3)
-    return {
-        "outcome": exchange.outcome,
-        "detail": exchange.detail,
-        "refused": exchange.refused,
-        "latency_ms": latency,
-    }

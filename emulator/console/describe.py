@@ -8,10 +8,15 @@ import typing
 from typing import Any, Final
 
 import numpy as np
+from pydantic import BaseModel
 
 from starhil.emulator.console.history import COLUMNS, KEPT_ROWS, MODES
+from starhil.emulator.console.obc import json_integer
 from starhil.emulator.console.pointing import DEFAULT_RATE_DEG_S
+from starhil.emulator.device.clock_errors import ClockFault
+from starhil.emulator.device.telemetry_faults import TelemetryFault
 from starhil.emulator.links.table import BUSES, LINKS
+from starhil.emulator.links.traffic import CONSOLE_BUS
 from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.run import Run
 from starhil.emulator.run.faults import EFFECTS, DeviceFault
@@ -40,7 +45,9 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
     links = {key: head.ready_fields[key] for key in LINKS if key in head.ready_fields}
     return {
         "head": head.number,
-        "heads": [f"{each.number}: {each.profile.name}" for each in run.heads],
+        "heads": [
+            {"head": each.number, "unit": each.icd.name, "profile": each.profile.name} for each in run.heads
+        ],
         "columns": COLUMNS,
         "kept_rows": KEPT_ROWS,
         "modes": MODES,
@@ -48,7 +55,7 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
         "seed": head.profile.run.seed,
         "clock": run.clock.name,
         "links": links,
-        "buses": BUSES,
+        "buses": {**BUSES, CONSOLE_BUS: "console's own line"},
         "camera": head.warm.camera if head.warm is not None else head.profile.camera.values(),
         "unit": {"name": icd.name, "version": icd.version},
         "telecommands": [describe_row(row, icd) for row in icd.rows if row.kind == "telecommand"],
@@ -69,6 +76,7 @@ def describe_row(row: Row, icd: InterfaceDefinition) -> dict[str, Any]:
         "id": row.id,
         "name": row.name,
         "doc": row.doc,
+        "confirm": row.confirm,
         "fields": [_describe_field(field, icd) for field in row.named_fields.values()],
     }
 
@@ -85,7 +93,7 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
         low, high = field.physical_limits
         bounded = field.kind != "float" or field.minimum is not None or field.maximum is not None
         if bounded and abs(low) < 1e38 and abs(high) < 1e38:
-            values |= {"min": low, "max": high}
+            values |= {"min": _limit(low), "max": _limit(high)}
     if field.enum is not None:
         values["values"] = list(field.enum.values)
     if field.name == "parameter" and icd.parameters:
@@ -95,24 +103,31 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
     return values
 
 
+def _limit(number: float) -> float | str:
+    """Return a limit for JSON."""
+    return json_integer(number) if isinstance(number, int) else number
+
+
 def fault_controls(icd: InterfaceDefinition, buses: list[str]) -> list[dict[str, Any]]:
     """Return the controls for faults by level: name, kind and range of each value."""
     choices = {
         **{key: effect.names(icd) for key, effect in EFFECTS.items() if effect.enum},
         "parameter": list(icd.device_parameters),
+        "row": list(icd.telemetry),
+        "answer_with": list(icd.telemetry),
     }
     share = {"name": "blocked_share", "kind": "number", "min": 0.0, "max": 1.0, "default": 0.0}
     levels = [
         {"level": "optical", "title": "sky and optics", "controls": [share, *_class_controls(SkyObjects)]},
         {"level": "device", "title": "device", "controls": _model_controls(DeviceFault, choices)},
+        {"level": "clock", "title": "clock", "controls": _model_controls(ClockFault, choices)},
+        {"level": "telemetry", "title": "telemetry", "controls": _model_controls(TelemetryFault, choices)},
     ]
     wire = _model_controls(WireFault, choices)
     return levels + [{"level": bus, "title": BUSES[bus], "controls": wire} for bus in dict.fromkeys(buses)]
 
 
-def _model_controls(
-    model: type[DeviceFault | WireFault], choices: dict[str, list[str]]
-) -> list[dict[str, Any]]:
+def _model_controls(model: type[BaseModel], choices: dict[str, list[str]]) -> list[dict[str, Any]]:
     schema = model.model_json_schema()
     return _schema_controls(schema["properties"], schema.get("$defs", {}), choices)
 
@@ -121,7 +136,14 @@ def _schema_controls(
     properties: dict[str, Any], models: dict[str, Any], choices: dict[str, list[str]]
 ) -> list[dict[str, Any]]:
     """Return the controls for a model from its JSON schema; a nested model becomes a group."""
-    kinds = {"boolean": "flag", "integer": "integer", "number": "number", "string": "choice"}
+    kinds = {
+        "boolean": "flag",
+        "integer": "integer",
+        "number": "number",
+        "string": "choice",
+        "array": "list",
+        "object": "table",
+    }
     controls: list[dict[str, Any]] = []
     for name, schema in properties.items():
         content = schema["anyOf"][0] if "anyOf" in schema else schema
@@ -138,7 +160,7 @@ def _schema_controls(
                 "min": content.get("minimum"),
                 "max": content.get("maximum"),
                 "default": schema.get("default"),
-                "values": choices.get(name),
+                "values": content.get("enum", choices.get(name)),
             }
         )
     return controls

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -43,10 +45,21 @@ MODES: Final = tuple(mode.value for mode in Mode)
 NO_FRAMES: Final = "no_images"
 """Reason why the attitude is not valid in a mode without frames."""
 
+TIMES: Final = 2
+"""Number of leading columns that are times, which a page is sent in double precision; the others are in single precision."""
+
 KEPT_ROWS: Final = 36_000
 """Number of rows in the history: an hour at 10 Hz."""
 
 Numbers = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Image:
+    """An image for pages, as JPEG, and its description with the overlay: JSON without the outer braces."""
+
+    description: str
+    jpeg: bytes
 
 
 class History:
@@ -81,11 +94,19 @@ class History:
         """Number of rows ever added, and of the next one."""
         return self._count
 
-    def rows(self, start: int = 0, most: int = KEPT_ROWS) -> Numbers:
-        """Return a copy of the rows (n, columns) from a number on, of those that are still kept, oldest first."""
-        first = max(start, self._count - len(self._rows))
-        numbers = np.arange(first, max(first, min(self._count, first + most)))
-        return self._rows[numbers % len(self._rows)]
+    @property
+    def start(self) -> int:
+        """Number of the first row that is kept."""
+        return self._count - len(self)
+
+    def rows(self, numbers: range) -> Numbers:
+        """Return a copy of rows (n, columns) that are kept."""
+        return self._rows[np.array(numbers, dtype=np.int64) % len(self._rows)]
+
+    def block(self, numbers: range) -> bytes:
+        """Return rows for a page, little-endian: the times of all rows (f64), then their other columns (f32)."""
+        rows = self.rows(numbers)
+        return rows[:, :TIMES].astype("<f8").tobytes() + rows[:, TIMES:].astype("<f4").tobytes()
 
     def _row(self, measurement: Measurement) -> list[float]:
         result, truth = measurement.result, measurement.truth
@@ -134,25 +155,23 @@ class History:
         return self.reasons.index(reason)
 
 
-def json_row(row: list[float]) -> list[float | None]:
+def json_row(row: Iterable[float]) -> list[float | None]:
     """Return a row for JSON, with None for NaN."""
     return [value if math.isfinite(value) else None for value in map(float, row)]
 
 
-def frame_message(measurement: Measurement, row: list[float]) -> bytes:
-    """Return a frame as a message for a page: `F`, the sizes of two JSON objects, the objects, and the JPEG.
-
-    The first object has the numbers of the frame, the second the overlay of the image.
-    """
+def image_of(measurement: Measurement, number: int, row: list[float]) -> Image | None:
+    """Return the image of a measurement for pages, with the number and the content of its row; None if there is none."""
     preview = measurement.result.preview
-    numbers = json.dumps(
-        {
-            "row": json_row(row),
-            "late": measurement.late,
-            "rejected": measurement.result.refused,
-            "true_q": measurement.truth.attitude.quaternion_xyzw.tolist(),
-        }
-    ).encode()
-    overlay, jpeg = (b"{}", b"") if preview is None else (preview.overlay, preview.jpeg)
-    sizes = len(numbers).to_bytes(4, "little") + len(overlay).to_bytes(4, "little")
-    return b"".join((b"F", sizes, numbers, overlay, jpeg))
+    if preview is None:
+        return None
+    numbers = {
+        "n": number,
+        "row": json_row(row),
+        "late": measurement.late,
+        "rejected": measurement.result.refused,
+        "true_q": measurement.truth.attitude.quaternion_xyzw.tolist(),
+    }
+    overlay = preview.overlay.decode().strip()[1:-1]
+    description = json.dumps(numbers)[1:-1] + (f", {overlay}" if overlay else "")
+    return Image(description, preview.jpeg)

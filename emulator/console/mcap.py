@@ -16,21 +16,22 @@ import json
 import logging
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
 from mcap.writer import CompressionType, Writer
 
-from starhil.emulator.console.history import COLUMNS, MODES, UNITS, History, json_row
+from starhil.emulator.console.events import EventLog, RunEvent
+from starhil.emulator.console.history import COLUMNS, MODES, UNITS, History, Numbers, json_row
 from starhil.emulator.console.obc import POLL_S, ObcConnection, decode
 from starhil.emulator.device.measurement import Measurement
-from starhil.emulator.device.modes import Transition
 from starhil.emulator.links.traffic import Decoder, WireItem
 from starhil.emulator.run.head import Head
 from starhil.emulator.simulation.guard import log_internal_error
 from starhil.emulator.simulation.output_file import OutputFile
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.conventions import NANOSECONDS
 
@@ -85,6 +86,10 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
 """Schema → properties. The first three are defined, and displayed, by Foxglove. `out` is true for what the device sent."""
 
 
+KEPT_SCHEMAS: Final = ("starhil.Measurement", "foxglove.Log", "starhil.Traffic")
+"""Schemas of a recording of what the console keeps."""
+
+
 def _telemetry_schema(row: Row) -> dict[str, Any]:
     """Return the properties of a telemetry row, with units and meanings."""
     return {
@@ -93,16 +98,19 @@ def _telemetry_schema(row: Row) -> dict[str, Any]:
     }
 
 
-INFO: Final = 2
-"""Level of foxglove.Log."""
+LEVELS: Final = {"info": 2, "good": 2, "bad": 3}
+"""Level of an event → level of foxglove.Log: information or warning."""
 
 
 class McapRecorder:
     """Records a run. Log times are simulation time since `run.start_unix_s`, whatever the device's clock shows."""
 
-    def __init__(self, head: Head, client: ObcConnection, path: Path, *, overwrite: bool = False) -> None:
+    def __init__(
+        self, head: Head, client: ObcConnection, events: EventLog, path: Path, *, overwrite: bool = False
+    ) -> None:
         self._head = head
         self._client = client
+        self._events = events
         self._history = History(1)
         self._room = threading.Semaphore(MAX_PENDING)
         self._start_ns = round(head.profile.run.start_unix_s * NANOSECONDS)
@@ -118,18 +126,12 @@ class McapRecorder:
         telemetry = {
             f"starhil.Telemetry.{row.name}": _telemetry_schema(row) for row in head.icd.telemetry.values()
         }
-        self._schemas = {
-            name: self._writer.register_schema(
-                name=name,
-                encoding="jsonschema",
-                data=json.dumps({"title": name, "type": "object", "properties": properties}).encode(),
-            )
-            for name, properties in (SCHEMAS | telemetry).items()
-        }
-        self._decoder = Decoder(head.icd, head.serial_dialect)
+        self._schemas = _register(self._writer, SCHEMAS | telemetry)
+        objects = DeviceDictionary(head.icd) if "canopen" in head.links else None
+        self._decoder = Decoder(head.icd, head.serial_dialect, objects)
         self._traffic: list[tuple[int, WireItem]] = []
         """Traffic that is not queued yet, each item with its simulation time, nanoseconds."""
-        self._on_disk(functools.partial(self._writer.add_metadata, "starhil.run", self._metadata()))
+        self._on_disk(functools.partial(self._writer.add_metadata, "starhil.run", _metadata(head)))
         self._channels: dict[str, int] = {}
         self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="record")
 
@@ -138,7 +140,7 @@ class McapRecorder:
         head = self._head
         head.imager.watchers.add(self)
         head.device.signals.frame_published.connect(self._record_frame)
-        head.device.signals.mode_changed.connect(self._record_mode)
+        self._events.added.connect(self._record_event)
         head.device.signals.faults_changed.connect(self._record_faults)
         head.traffic.passed.connect(self._record_traffic)
         self._task = asyncio.create_task(self._record_telemetry())
@@ -182,8 +184,7 @@ class McapRecorder:
         self._write("/truth", "foxglove.FrameTransform", at_ns, truth)
         row = dict(zip(COLUMNS, json_row(self._history.add(measurement)), strict=True))
         known = {name: value for name, value in row.items() if value is not None}  # a schema has no null
-        values: dict[str, Any] = {**known, "valid": measurement.valid, "reason": measurement.reason}
-        values["mode"] = MODES[int(row["mode"] or 0)]
+        values = _named(known, measurement.reason)
         self._write("/measurement", "starhil.Measurement", at_ns, values)
         if measurement.result.features is not None:
             features = dataclasses.asdict(measurement.result.features)
@@ -191,34 +192,13 @@ class McapRecorder:
                 del features["error_psi"]
             self._write("/features", "starhil.Features", at_ns, features)
 
-    def _metadata(self) -> dict[str, str]:
-        """Return what identifies the run."""
-        head, profile = self._head, self._head.profile
-        return {
-            "starhil": importlib.metadata.version("starhil"),
-            "head": str(head.number),
-            "unit": profile.unit_source,
-            "unit_version": head.icd.version,
-            "profile": profile.source,
-            "seed": str(profile.run.seed),
-            "clock": profile.run.clock,
-            "start_unix_s": repr(profile.run.start_unix_s),
-            "settings": profile.model_dump_json(exclude_unset=True),
-        }
-
-    def _record_mode(self, transition: Transition) -> None:
-        self._record_event(
-            f"mode {transition.before.value} → {transition.after.value} ({transition.cause.value})"
-        )
-
-    def _record_faults(self, request: dict[str, Any]) -> None:
-        self._record_event(f"fault {json.dumps(request)}" if request else "faults ended")
+    def _record_faults(self, _request: dict[str, Any]) -> None:
         self._write("/faults", "starhil.Faults", self._head.clock.now_ns(), self._head.faults.describe())
 
-    def _record_event(self, text: str) -> None:
-        device = self._head.device
-        content = {**self._stamp(device.time.unix_ns()), "level": INFO, "message": text, "name": "device"}
-        self._write("/events", "foxglove.Log", device.clock.now_ns(), content)
+    def _record_event(self, event: RunEvent) -> None:
+        at_ns = round(event.t * NANOSECONDS)
+        stamp = self._stamp(self._head.device.time.unix_ns(at_ns))
+        self._write("/events", "foxglove.Log", at_ns, {**stamp, **_log_entry(event)})
 
     def _record_traffic(self, item: WireItem) -> None:
         if not self._traffic:
@@ -305,3 +285,95 @@ class McapRecorder:
         if not self.file.output.failed:
             with self.file.output.guarded():
                 action()
+
+
+def _register(writer: Writer, schemas: dict[str, dict[str, Any]]) -> dict[str, int]:
+    """Register schemas; return their numbers by name."""
+    return {
+        name: writer.register_schema(
+            name=name,
+            encoding="jsonschema",
+            data=json.dumps({"title": name, "type": "object", "properties": properties}).encode(),
+        )
+        for name, properties in schemas.items()
+    }
+
+
+def _metadata(head: Head) -> dict[str, str]:
+    """Return what identifies the run."""
+    profile = head.profile
+    return {
+        "starhil": importlib.metadata.version("starhil"),
+        "head": str(head.number),
+        "unit": profile.unit_source,
+        "unit_version": head.icd.version,
+        "profile": profile.source,
+        "seed": str(profile.run.seed),
+        "clock": profile.run.clock,
+        "start_unix_s": repr(profile.run.start_unix_s),
+        "settings": profile.model_dump_json(exclude_unset=True),
+    }
+
+
+def _named(numbers: dict[str, float], reason: str) -> dict[str, Any]:
+    """Return the known numbers of a row with names for mode and reason."""
+    return {
+        **numbers,
+        "mode": MODES[int(numbers["mode"])],
+        "valid": numbers["valid"] == 1.0,
+        "reason": reason,
+    }
+
+
+def _log_entry(event: RunEvent) -> dict[str, Any]:
+    """Return an event as foxglove.Log without its timestamp."""
+    return {"level": LEVELS[event.level], "message": event.text, "name": event.kind}
+
+
+def recorded(
+    head: Head, rows: Numbers, reasons: Sequence[str], events: Sequence[RunEvent], items: Sequence[WireItem]
+) -> bytes:
+    """Return a recording of what is kept: numbers of frames, events, traffic; without images and telemetry of the console.
+
+    Traffic has the machine's times; its log time is found by the last event before it, whose both times are known.
+    """
+    stream = io.BytesIO()
+    writer = Writer(stream, compression=CompressionType.ZSTD)
+    writer.start(profile="", library="starhil")
+    schemas = _register(writer, {name: SCHEMAS[name] for name in KEPT_SCHEMAS})
+    writer.add_metadata("starhil.run", _metadata(head))
+    start_ns = round(head.profile.run.start_unix_s * NANOSECONDS)
+    channels: dict[str, int] = {}
+
+    def add(topic: str, schema: str, run_s: float, content: dict[str, Any]) -> None:
+        if topic not in channels:
+            channels[topic] = writer.register_channel(
+                topic=topic, message_encoding="json", schema_id=schemas[schema]
+            )
+        at_ns = max(0, start_ns + round(run_s * NANOSECONDS))
+        data = json.dumps(content).encode()
+        writer.add_message(channel_id=channels[topic], log_time=at_ns, publish_time=at_ns, data=data)
+
+    for row in rows:
+        known = {name: value for name, value in zip(COLUMNS, json_row(row), strict=True) if value is not None}
+        add(
+            "/measurement",
+            "starhil.Measurement",
+            known["run_s"],
+            _named(known, reasons[int(known["reason"])]),
+        )
+    for event in events:
+        add("/events", "foxglove.Log", event.t, _log_entry(event))
+    objects = DeviceDictionary(head.icd) if "canopen" in head.links else None
+    decoder = Decoder(head.icd, head.serial_dialect, objects)
+    known_times = iter([*((event.wall_s, event.t) for event in events), (math.inf, 0.0)])
+    (wall_s, run_s), following = next(known_times), next(known_times)
+    for item in items:
+        while following[0] <= item.at_s:
+            (wall_s, run_s), following = following, next(known_times)
+        line = decoder.line(item)
+        if not line["own"]:
+            content = {name: line[name] for name in SCHEMAS["starhil.Traffic"]}
+            add(f"/bus/{item.bus}", "starhil.Traffic", run_s + max(0.0, item.at_s - wall_s), content)
+    writer.finish()  # type: ignore[no-untyped-call]
+    return stream.getvalue()

@@ -18,8 +18,14 @@ from starhil.protocol.icd.codec import Field, Row
 from starhil.protocol.icd.values import Value
 from starhil.protocol.serial.cubespace import Dialect
 
+EXACT: Final = 2**53
+"""Integer up to which a page has all of them."""
+
 KEPT_STEPS: Final = 1000
 """Number of latest transactions that can be saved as a session."""
+
+SHOWN_STEPS: Final = 200
+"""Number of latest transactions that a page shows."""
 
 POLL_S: Final = 1.0
 """Period in which the console reads every telemetry row that a page shows, and a recording every row, seconds."""
@@ -99,6 +105,18 @@ class SentStep:
     data: bytes
     values: Mapping[str, Value]
     exchange: Exchange
+    wall_s: float
+    """Unix time of the request."""
+
+    def content(self) -> dict[str, Any]:
+        """Return what a page shows of it."""
+        return {
+            "kind": str(self.row.kind),
+            "row": self.row.name,
+            "values": {key: json_value(value) for key, value in self.values.items()},
+            "wall_s": self.wall_s,
+            **exchange_content(self.exchange),
+        }
 
 
 class ConsoleObc:
@@ -122,6 +140,10 @@ class ConsoleObc:
     def steps(self) -> int:
         """Number of recorded transactions."""
         return len(self._steps)
+
+    def sent(self, most: int = SHOWN_STEPS) -> list[dict[str, Any]]:
+        """Return the latest transactions for a page, oldest first."""
+        return [step.content() for step in list(self._steps)[-most:]]
 
     def clear(self) -> None:
         """Discard the recorded transactions."""
@@ -169,9 +191,9 @@ class ConsoleObc:
         return exchange, decode(row, exchange)
 
     async def _exchange(self, row: Row, data: bytes, values: Mapping[str, Value]) -> Exchange:
-        begin_s = self._clock()
+        begin_s, wall_s = self._clock(), time.time()
         exchange = await self.client.exchange(row, data)
-        self._steps.append(SentStep(begin_s, self._clock(), row, data, values, exchange))
+        self._steps.append(SentStep(begin_s, self._clock(), row, data, values, exchange, wall_s))
         return exchange
 
     def _row(self, kind: str, name: str) -> Row:
@@ -261,4 +283,20 @@ def json_value(value: Value) -> Any:
         return value.hex(" ").upper()
     if isinstance(value, float) and not abs(value) < float("inf"):
         return None
-    return value
+    return json_integer(value) if isinstance(value, int) else value
+
+
+def json_integer(value: int | bool) -> int | str:
+    """Return an integer for JSON, as text if a page would round it."""
+    return value if abs(value) <= EXACT else str(value)
+
+
+def exchange_content(exchange: Exchange) -> dict[str, Any]:
+    """Return the outcome of a request as JSON data."""
+    latency = None if exchange.latency_s is None else round(exchange.latency_s * 1e3, 3)
+    return {
+        "outcome": exchange.outcome,
+        "detail": exchange.detail,
+        "refused": exchange.refused,
+        "latency_ms": latency,
+    }

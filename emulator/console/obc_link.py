@@ -10,6 +10,7 @@ from starhil.emulator.links.base import AnyLink
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.links.table import LINKS, LinkName
+from starhil.emulator.links.traffic import CONSOLE_BUS
 from starhil.emulator.run.head import Head
 from starhil.protocol.icd import InterfaceDefinition
 
@@ -36,6 +37,7 @@ async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[
         separate = _open_virtual_bus(head)
     if separate is not None:
         closers.append(separate.close)
+        head.traffic.add(separate, CONSOLE_BUS)
         where = await separate.start()
     client = make_client(
         ObcPort(

@@ -53,7 +53,7 @@ def pointing_request(
     content: dict[str, Any] = {"attitude": of_body(here)}
     if kind == "rate":
         rate = wanted.get("rate_deg_s")
-        if not isinstance(rate, list) or len(rate) != 3 or not all(map(_is_number, rate)):
+        if not isinstance(rate, list) or len(rate) != 3 or not all(map(is_number, rate)):
             raise EmulatorError("rate_deg_s: three numbers are needed")
         content["rate_deg_s"] = (to_body @ np.array(rate)).tolist()
     elif kind in ("slew", "fixed"):
@@ -68,7 +68,7 @@ def pointing_request(
     return {"do": "set_truth", "truth": {"kind": kind, **content}}
 
 
-def _is_number(value: object) -> bool:
+def is_number(value: object) -> bool:
     """Return whether a value is a number with which the truth can be computed."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < MAX_NUMBER
 

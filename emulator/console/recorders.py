@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
 if TYPE_CHECKING:
+    from starhil.emulator.console.events import EventLog
     from starhil.emulator.console.obc import ObcConnection
     from starhil.emulator.run.head import Head
     from starhil.emulator.simulation.output_file import OutputFile
@@ -33,14 +34,14 @@ class RecorderKind:
     """What the file is for, in the help of the option."""
     needs: str
     """Module of another package that it needs, which an extra installs."""
-    make: Callable[[Head, ObcConnection, Path, bool], FileRecorder]
+    make: Callable[[Head, ObcConnection, EventLog, Path, bool], FileRecorder]
     """Makes a recorder for a head, with an OBC on its bus; the flag is whether an existing file is replaced."""
 
 
-def _mcap(head: Head, client: ObcConnection, path: Path, overwrite: bool) -> FileRecorder:
+def _mcap(head: Head, client: ObcConnection, events: EventLog, path: Path, overwrite: bool) -> FileRecorder:
     from starhil.emulator.console.mcap import McapRecorder
 
-    return McapRecorder(head, client, path, overwrite=overwrite)
+    return McapRecorder(head, client, events, path, overwrite=overwrite)
 
 
 RECORDERS: Final[Mapping[str, RecorderKind]] = {

@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import gzip
 import json
 import logging
 import secrets
 import socket
 import sys
+import zlib
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, cast
@@ -19,17 +21,30 @@ from aiohttp import WSMsgType, web
 from aiohttp.http import HttpProcessingError
 
 from starhil.emulator.console.console import Console
+from starhil.emulator.console.pcapng import pcapng
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.control.channel import REQUEST_S
 from starhil.emulator.control.token import is_token
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth.json_lines import JsonError, parse_object
-from starhil.protocol.errors import reason
+from starhil.protocol.errors import escape_controls, reason
 from starhil.protocol.transports.connections import WINDOW, ConnectionLimit, detect_lost_peer
 
 log = logging.getLogger("starhil.console")
 
 STATIC: Final = Path(__file__).resolve().parent / "static"
+
+KINDS: Final = {
+    ".css": "text/css",
+    ".html": "text/html",
+    ".js": "text/javascript",
+    ".LICENSE": "text/plain",
+}
+"""Suffix of a file of the page → its type."""
+
+DOCS: Final = Path(__file__).resolve().parents[2] / "docs"
+"""Folder of the pages of the documentation, in the installation or checkout."""
 
 LARGEST_MESSAGE: Final = 1 << 16
 """Longest message that a page may send, bytes."""
@@ -53,12 +68,6 @@ PAGE_TURN_S: Final = 0.01
 
 OPENING_S: Final = 0.05
 """Shortest time between two pages that open, seconds."""
-
-HISTORY: Final = b"H" + bytes(7)
-"""Begin of a message with rows of the history."""
-
-HISTORY_PART: Final = 1000
-"""Number of rows of the history that are sent at a time."""
 
 LINGER_S: Final = 1.0
 """Time for which the rest of a rejected request is read, so that its peer receives the answer, seconds."""
@@ -86,14 +95,18 @@ class ConsoleServer:
     ----------
     view_token
         Another token, whose pages may look but not command; empty: there is none.
+    command_token
+        Token of pages that may command; empty: a random one.
     """
 
-    def __init__(self, consoles: Sequence[Console], view_token: str = "") -> None:
+    def __init__(self, consoles: Sequence[Console], view_token: str = "", command_token: str = "") -> None:
         self._consoles = consoles
-        self.token = secrets.token_urlsafe(18)
+        self.token = command_token or secrets.token_urlsafe(18)
         self._view_token = view_token
         self._turn = asyncio.Lock()
         self._opening = asyncio.Lock()
+        self._files: dict[str, tuple[bytes, str]] = {}
+        """Files of the page that have been read: compressed, and their tag."""
         self._runner: web.AppRunner | None = None
         self._listener: asyncio.Server | None = None
 
@@ -109,8 +122,12 @@ class ConsoleServer:
         app.router.add_get("/ws", self._socket)
         app.router.add_get("/session.toml", self._session)
         app.router.add_get("/wire.log", self._wire_log)
+        app.router.add_get("/wire.txt", self._wire_text)
+        app.router.add_get("/wire.pcapng", self._wire_pcapng)
+        app.router.add_get("/record.mcap", self._record)
+        app.router.add_get("/docs/{page}", _docs)
         app.router.add_post("/runs", self._report)
-        app.router.add_static("/static", STATIC)
+        app.router.add_get("/static/{path:.*}", self._static)
         self._runner = web.AppRunner(
             app,
             access_log=None,
@@ -135,7 +152,7 @@ class ConsoleServer:
         name = f"[{bound[0]}]" if ":" in bound[0] else bound[0]
         page = f"http://{name}:{bound[1]}/?token="
         only = {"view_only": page + quote(self._view_token, safe="")} if self._view_token else {}
-        return {"view": page + self.token, **only}
+        return {"view": page + quote(self.token, safe=""), **only}
 
     async def close(self) -> None:
         """Stop listening and close all connections."""
@@ -191,12 +208,46 @@ class ConsoleServer:
             raise EmulatorError(f"head: must be 1 to {len(known)}, not {wanted!r}")
         return known[wanted]
 
+    async def _static(self, request: web.Request) -> web.Response:
+        """Return a file of the page, compressed."""
+        path = request.match_info["path"]
+        file = (STATIC / path).resolve()
+        kind = KINDS.get(file.suffix)
+        if kind is None or not file.is_relative_to(STATIC) or not file.is_file():
+            return web.Response(status=404, text="404: no such file\n")
+        if path not in self._files:
+            data = await asyncio.to_thread(lambda: gzip.compress(file.read_bytes()))
+            self._files[path] = data, f'"{zlib.crc32(data):08x}"'
+        data, tag = self._files[path]
+        headers = {"ETag": tag}
+        if request.headers.get("If-None-Match") == tag:
+            return web.Response(status=304, headers=headers)
+        if "gzip" not in request.headers.get("Accept-Encoding", ""):
+            return web.Response(
+                body=gzip.decompress(data), content_type=kind, charset="utf-8", headers=headers
+            )
+        headers["Content-Encoding"] = "gzip"
+        return web.Response(body=data, content_type=kind, charset="utf-8", headers=headers)
+
     async def _session(self, request: web.Request) -> web.Response:
         text = self._console(request).obc.session("Recorded in the console")
         return _download(text, "session.toml", "application/toml")
 
     async def _wire_log(self, request: web.Request) -> web.Response:
         return _download(self._console(request).trace.candump(), "wire.log", "text/plain")
+
+    async def _wire_text(self, request: web.Request) -> web.Response:
+        text = await in_thread(self._console(request).trace.text)
+        return _download(text, "wire.txt", "text/plain")
+
+    async def _wire_pcapng(self, request: web.Request) -> web.Response:
+        data = await in_thread(pcapng, self._console(request).trace.items())
+        return _download(data, "wire.pcapng", "application/octet-stream")
+
+    async def _record(self, request: web.Request) -> web.Response:
+        """Return what is known of the last hour as an MCAP file."""
+        data = await self._console(request).recording()
+        return _download(data, "record.mcap", "application/octet-stream")
 
     async def _report(self, request: web.Request) -> web.Response:
         try:
@@ -218,18 +269,22 @@ class ConsoleServer:
         console = self._console(request)
         if sum(len(each.viewers) for each in self._consoles) >= MAX_VIEWERS:
             return web.Response(status=503, text=f"503: {MAX_VIEWERS} pages are already open\n")
-        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE, compress=False)
+        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE)
         await socket.prepare(request)
         if request.transport is not None:
             _limit_unsent(request.transport)
-        viewer = Viewer(socket, commands=self._has_token(request, self.token))
+        viewer = Viewer(
+            socket,
+            console.history,
+            console.trace,
+            console.events,
+            commands=self._has_token(request, self.token),
+        )
         tasks: set[asyncio.Task[None]] = set()
         try:
             async with self._opening:
                 await console.welcome(viewer)
                 await asyncio.sleep(OPENING_S)
-            await viewer.flush()
-            await _send_history(console, socket)
             console.join(viewer)
             tasks.add(asyncio.create_task(_pump(viewer, socket)))
             await self._receive(console, socket, viewer, tasks)
@@ -250,7 +305,7 @@ class ConsoleServer:
     async def _receive(
         self, console: Console, socket: web.WebSocketResponse, viewer: Viewer, tasks: set[asyncio.Task[None]]
     ) -> None:
-        """Execute the requests of a page until it closes; they wait while it does not read its messages."""
+        """Execute the requests of a page until it closes."""
         async for message in socket:
             await asyncio.sleep(PAGE_TURN_S)
             await self._wait_for_turn()
@@ -262,10 +317,8 @@ class ConsoleServer:
                 viewer.send(json.dumps({"type": "answer", "id": None, "ok": False, "error": str(wrong)}))
                 continue
             if request.get("do") == "received":
-                viewer.acknowledge()
+                viewer.acknowledge(request.get("at"))
                 continue
-            while viewer.behind:
-                await asyncio.sleep(PAGE_TURN_S)
             if len(tasks) > MAX_REQUESTS:
                 error = f"more than {MAX_REQUESTS} requests at a time"
                 answer = {"type": "answer", "id": request.get("id"), "ok": False, "error": error}
@@ -304,18 +357,12 @@ class _Gate(asyncio.Protocol):
             protocol.connection_made(transport)
 
 
-async def _send_history(console: Console, socket: web.WebSocketResponse) -> None:
-    """Send the history in parts of rows of 64-bit floats, oldest first; the last part is empty."""
-    history, start, complete = console.history, 0, False
-    while not complete:
-        start = max(start, history.end - len(history))
-        rows = history.rows(start, HISTORY_PART)
-        start += len(rows)
-        await socket.send_bytes(HISTORY + rows.tobytes())
-        complete = not len(rows) and start == history.end  # rows may come while others are sent
-
-
 async def _answer(console: Console, viewer: Viewer, request: dict[str, object]) -> None:
+    """Answer a request, once the page has read what it was sent and its earlier requests have begun."""
+    async with viewer.turn:
+        await asyncio.sleep(PAGE_TURN_S)
+        while viewer.behind:
+            await asyncio.sleep(PAGE_TURN_S)
     viewer.send(json.dumps(await console.answer(viewer, request)))
 
 
@@ -339,9 +386,19 @@ def _is_same_origin(request: web.Request) -> bool:
         return False
 
 
-def _download(text: str, name: str, kind: str) -> web.Response:
+async def _docs(request: web.Request) -> web.StreamResponse:
+    """Return a page of the documentation, in Markdown."""
+    page = request.match_info["page"]
+    path = DOCS / f"{page}.md"
+    if not page.replace("-", "").isalnum() or not path.is_file():
+        raise EmulatorError(f"docs: there is no page {escape_controls(page)}")
+    return web.Response(text=path.read_text(encoding="utf-8"), content_type="text/plain", charset="utf-8")
+
+
+def _download(content: str | bytes, name: str, kind: str) -> web.Response:
+    body = content.encode() if isinstance(content, str) else content
     return web.Response(
-        text=text, content_type=kind, headers={"Content-Disposition": f'attachment; filename="{name}"'}
+        body=body, content_type=kind, headers={"Content-Disposition": f'attachment; filename="{name}"'}
     )
 
 

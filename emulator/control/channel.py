@@ -19,8 +19,9 @@ import json
 import logging
 from collections import deque
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, get_args
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -28,12 +29,13 @@ from pydantic import BaseModel, ValidationError
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.control.token import is_token
+from starhil.emulator.device.cycle import Phase
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.run import Run
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.run.head import Head
-from starhil.emulator.run.tape import ClearedFaults, NewFaults
+from starhil.emulator.run.tape import AwaitedPhase, ClearedFaults, NewFaults
 from starhil.emulator.run.truth_log import compare
 from starhil.emulator.sensor.pipeline.messages import as_quaternion
 from starhil.emulator.simulation.guard import until_cancelled
@@ -56,6 +58,9 @@ EXAMINED_ERRORS: Final = 200
 """Number of errors of a request that are examined; of further ones the answer gives the number."""
 
 KEPT_FRAMES: Final = 200
+PHASE_WITHIN_S: Final = 30.0
+"""Longest wait for a phase of an exposure, unless a request gives another one, simulation time, seconds."""
+SHORTEST_WAIT_S: Final = 1e-4
 BUSY_ANSWER: Final = (
     b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
 )
@@ -94,6 +99,7 @@ class ControlServer:
             "frames": (self._last_frames, ("count",)),
             "set_truth": (self._set_truth, ("truth",)),
             "step": (self._step, ("seconds",)),
+            "wait": (self._wait, ("seconds", "phase", "within_s")),
             "fault": (self._fault, None),
             "clear_faults": (self._clear_faults, ()),
             "scenario": (self._run_scenario, ("name",)),
@@ -247,7 +253,7 @@ class ControlServer:
         if "run_time_s" in request:
             run_ns = round(_number(request, "run_time_s") * NANOSECONDS)
         elif "unix_s" in request:
-            run_ns = round(_number(request, "unix_s") * NANOSECONDS) - device.time.offset_ns
+            run_ns = device.time.run_ns(round(_number(request, "unix_s") * NANOSECONDS))
         state = device.surroundings.truth.state(run_ns / NANOSECONDS)
         return {
             "run_time_s": run_ns / NANOSECONDS,
@@ -283,9 +289,45 @@ class ControlServer:
         await stepper.step(_number(request, "seconds"))
         return {"run_time_s": clock.now_ns() / NANOSECONDS}
 
+    async def _wait(self, head: Head, request: dict[str, Any]) -> Answer:
+        clock = self._run.clock
+        if ("seconds" in request) == ("phase" in request):
+            raise EmulatorError("wait: give seconds or phase")
+        if "phase" in request:
+            await self._wait_for_phase(head, request)
+        elif self._run.stepper is not None:
+            raise EmulatorError("wait: time passes only by step on this clock; use step")
+        else:
+            until_ns = clock.running.now_ns() + round(_number(request, "seconds") * NANOSECONDS)
+            while (left_ns := until_ns - clock.running.now_ns()) > 0:
+                await asyncio.sleep(max(left_ns / NANOSECONDS / clock.speed, SHORTEST_WAIT_S))
+            self._run.wiring.latch()
+        return {"run_time_s": clock.now_ns() / NANOSECONDS}
+
+    async def _wait_for_phase(self, head: Head, request: dict[str, Any]) -> None:
+        """Wait for a phase of the next exposure; the stepped clock is advanced to it."""
+        phase, within_s = request["phase"], _number(request, "within_s", PHASE_WITHIN_S)
+        if phase not in (phases := get_args(Phase)):
+            raise EmulatorError(
+                f"phase: must be one of {', '.join(phases)}{did_you_mean(str(phase), phases)}"
+            )
+        reached = asyncio.Event()
+        self._run.wiring.enter(AwaitedPhase, phase=phase)
+        head.device.cycle.at_phase(phase, lambda _due_ns: reached.set())
+        if self._run.stepper is not None:
+            await self._run.stepper.step(within_s, reached.is_set)
+        else:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(reached.wait(), within_s / self._run.clock.speed)
+        if not reached.is_set():
+            mode = head.device.modes.mode.value
+            raise EmulatorError(f"wait: no exposure has begun within {within_s:g} s (mode {mode})")
+
     async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
         wanted = await _parse(FaultRequest, request)
         head.faults.check(wanted)
+        if wanted.optical is not None:
+            await head.prepare_sky(wanted.optical)
         self._run.wiring.enter(NewFaults, request=wanted)
         head.faults.inject(wanted)
         return {"faults": head.faults.describe()}
@@ -300,7 +342,10 @@ class ControlServer:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         name, start_s = str(request.get("name", "")), self._run.clock.now_ns() / NANOSECONDS
         async with self._opening:
-            events = await in_thread(lambda: load_scenario(name).prepare(head, self._run.truth, start_s))
+            scenario = await in_thread(lambda: load_scenario(name))
+            events = await in_thread(lambda: scenario.prepare(head, self._run.truth, start_s))
+        for sky in scenario.skies:
+            await head.prepare_sky(sky)
         head.device.scheduler.add(events)
         return {"events": len(events)}
 

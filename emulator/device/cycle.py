@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, TypeVar
+from typing import Any, Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
+from starhil.emulator.device.clock_errors import ClockErrors
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Modes
 from starhil.emulator.device.navigation import observer_velocity
@@ -39,9 +40,10 @@ from starhil.emulator.sensor.pipeline.messages import (
     Triple,
 )
 from starhil.emulator.simulation.clock import DeviceTime
-from starhil.emulator.simulation.scheduler import Event, Scheduler
+from starhil.emulator.simulation.scheduler import Action, Event, Scheduler
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.icd.conventions import NANOSECONDS
+from starhil.protocol.icd.values import Value
 from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.identification.attitude_history import AttitudeHistory
@@ -55,6 +57,10 @@ MAX_PENDING: Final = 2
 
 LONGEST_GAP_PERIODS: Final = 2.5
 """Longest gap between two attitudes from which a rate is estimated, update periods."""
+
+
+Phase: TypeAlias = Literal["exposure", "mid_frame", "readout"]
+"""Begin, middle and end of an exposure."""
 
 
 @dataclass
@@ -87,6 +93,7 @@ class FrameCycle:
         scheduler: Scheduler,
         imager: PipelineClient,
         time: DeviceTime,
+        clock_errors: ClockErrors,
         parameters: Parameters,
         modes: Modes,
         surroundings: Surroundings,
@@ -96,6 +103,8 @@ class FrameCycle:
         self._scheduler = scheduler
         self._imager = imager
         self._time = time
+        self._clock_errors = clock_errors
+        self._start_unix_ns = round(profile.start_unix_s * NANOSECONDS)
         self._now_ns = time.clock.now_ns
         self._parameters = parameters
         self._modes = modes
@@ -109,6 +118,8 @@ class FrameCycle:
         self._failure = ""
         """Error text of the last request if the pipeline failed, so that an error is logged only once."""
         self._warned_of_aberration = False
+        self._awaiting: list[tuple[Phase, Action]] = []
+        """What is to be done in the next exposure, and in which phase."""
         self.upsets: tuple[CatalogUpset, ...] = ()
         """Bits flipped in the star catalogue since start-up."""
         self.index = 0
@@ -163,6 +174,10 @@ class FrameCycle:
         self._history.clear()
         self.published = self.skipped = 0
         self.upsets = ()
+
+    def at_phase(self, phase: Phase, action: Action) -> None:
+        """Do something once, at a phase of the next exposure that begins."""
+        self._awaiting.append((phase, action))
 
     def retime(self) -> None:
         """Apply a new update rate at once."""
@@ -219,6 +234,10 @@ class FrameCycle:
         start_ns = due_ns + int(self._parameters["delay_time"]) * 1_000_000
         end_ns = start_ns + round(exposure_s * NANOSECONDS)
         mid_ns = start_ns + round(exposure_s * NANOSECONDS / 2)
+        for phase, action in self._awaiting:
+            at_ns = {"exposure": start_ns, "mid_frame": mid_ns, "readout": end_ns}[phase]
+            self._scheduler.at(at_ns, action)
+        self._awaiting.clear()
         begun = (start_ns, mid_ns, self._modes.mode, exposure_s, period_ns / NANOSECONDS)
         self._scheduler.at(end_ns, self._until_stopped(lambda _: self._end_exposure(*begun)))
 
@@ -251,6 +270,28 @@ class FrameCycle:
     def index_request(self) -> IndexRequest:
         """Return the request for the star index of the current parameters."""
         return IndexRequest(SolverSettings.of(self._parameters), self.upsets)
+
+    def rehearsals(self, constants: Mapping[str, Value], skies: Sequence[Mapping[str, Any]]) -> IndexRequest:
+        """Return the request to prepare frames with the present parameters, and with each of these optical faults.
+
+        `constants` are parameters that the device is going to take from the camera.
+        """
+        parameters, now_ns = {**self._parameters, **constants}, self._now_ns()
+        truth = self._surroundings.state(now_ns)
+        conditions = self._surroundings.conditions(truth)
+        settings = SolverSettings.of(parameters)
+        frame = FrameRequest(
+            index=0,
+            truth=truth,
+            exposure_s=float(parameters["exposure"]) / 1000.0,
+            gain=float(parameters["analog_gain"]),
+            settings=settings,
+            temperature_c=conditions.temperature_c,
+            particles_s=conditions.particles_s,
+            observer_velocity=self._assumed_velocity(now_ns),
+        )
+        frames = tuple(replace(frame, faults=dict(sky)) for sky in skies)
+        return IndexRequest(settings, self.upsets, frames)
 
     def single_frame(self, mid_ns: int) -> FrameRequest:
         """Return the request for an exposure that is not solved, with a given simulation time of mid-exposure."""
@@ -310,6 +351,7 @@ class FrameCycle:
             frame.waiting_since_ns = due_ns
             return
         complete_ns = due_ns + round(self._timing.detect_per_star_s * frame.result.detected * NANOSECONDS)
+        complete_ns += self._clock_errors.latency_ns(frame.index)
         now_ns = self._now_ns()
         if complete_ns > now_ns:
             self._scheduler.at(complete_ns, self._until_stopped(partial(self._publish_in_order, frame)))
@@ -332,12 +374,14 @@ class FrameCycle:
         detect_s = timing.detect_s + timing.detect_per_star_s * result.detected
         identify_s = self._identify_s(tracking=frame.tracking)
         valid, reason, rate = self._assess(frame, result, detect_s + identify_s)
+        mid_unix_ns = self._time.unix_ns(frame.mid_ns) + self._clock_errors.tag_error_ns(frame.index)
         self.published += 1
         self._signals.frame_published.emit(
             Measurement(
                 counter=self.published,
                 mid_ns=frame.mid_ns,
-                mid_unix_ns=self._time.unix_ns(frame.mid_ns),
+                mid_unix_ns=mid_unix_ns,
+                clock_error_ns=mid_unix_ns - self._start_unix_ns - frame.mid_ns,
                 published_ns=published_ns,
                 mode=frame.mode,
                 truth=frame.truth,

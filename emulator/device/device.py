@@ -8,6 +8,7 @@ from functools import reduce
 from types import MappingProxyType
 from typing import Any, Final, TypeAlias
 
+from starhil.emulator.device.clock_errors import ClockErrors, ClockFault
 from starhil.emulator.device.counters import Acknowledge, Counters
 from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.file_download import FileDownload
@@ -96,7 +97,6 @@ class Device:
         signals.mode_changed.connect(self._mode_changed, first=True)
         signals.parameters_changed.connect(self._parameters_changed, first=True)
         self.scheduler = Scheduler()
-        self.time = DeviceTime(clock)
         try:
             defaults = profile_defaults(profile, icd)
             self.parameters = Parameters(icd, defaults, signals.parameters_changed.emit)
@@ -107,12 +107,15 @@ class Device:
         self.modes = Modes(signals.mode_changed.emit)
         self.power = PowerModel(profile.power)
         self.thermal = ThermalModel(profile.thermal)
+        self.clock_errors = ClockErrors(profile.clock, self.thermal, profile.run.seed)
+        self.time = DeviceTime(clock, gained_ns=self.clock_errors.gained_ns)
         self.surroundings = Surroundings(profile, truth, self.thermal, clock.now_ns)
         self.cycle = FrameCycle(
             profile,
             self.scheduler,
             imager,
             self.time,
+            self.clock_errors,
             self.parameters,
             self.modes,
             self.surroundings,
@@ -181,8 +184,7 @@ class Device:
         self.latest = None
         self.selected_parameter = next(iter(self.icd.parameters_by_id), 0)
         self.started_ns = self.clock.now_ns()
-        self.time.offset_ns = round(self.profile.run.start_unix_s * NANOSECONDS) - self.started_ns
-        self.time.was_set = False
+        self.time.start(round(self.profile.run.start_unix_s * NANOSECONDS))
         self.accepted = NOTHING_ACCEPTED
         self.modes.reset()
         self.mode_changes = self.frames_valid = self.valid_in_a_row = 0
@@ -226,6 +228,16 @@ class Device:
         self.modes.booted()
         if self.parameters["start_mode"] == "lost_in_space":
             self.modes.command(Mode.LOST_IN_SPACE, has_attitude=False)
+
+    def fail_clock(self, fault: ClockFault) -> None:
+        """Let clock and latency have other errors from now on; those of the profile if the fault gives none."""
+        self.time.rebase()
+        self.clock_errors.fault = fault
+        if not fault.stuck_second:
+            self.time.stuck_s = None
+        elif self.time.stuck_s is None:
+            self.time.stuck_s = self.time.unix_ns() // NANOSECONDS
+        self.time.offset_ns += round(fault.jump_s * NANOSECONDS)
 
     # --- persistent state ---
 
@@ -358,6 +370,7 @@ class Device:
             self._power_changed()
 
     def _power_changed(self) -> None:
+        self.time.rebase()
         self.thermal.set_power(self.clock.now_ns(), self.power.mean_power_w(self.cycle.timing))
 
 
@@ -370,6 +383,18 @@ def rate_fields(icd: InterfaceDefinition) -> tuple[tuple[Field, int, float], ...
         for field in row.named_fields.values()
         if field.value in axes and field.kind == "integer"
     )
+
+
+def constants_to_adopt(
+    parameters: Parameters, profile: Profile, constants: Mapping[str, Value]
+) -> dict[str, Value]:
+    """Return the camera constants that `adopt_camera` will make values of parameters."""
+    defaults = parameters.state.defaults
+    return {
+        name: value
+        for name, value in constants.items()
+        if name not in profile.parameters and parameters[name] == defaults[name]
+    }
 
 
 def adopt_camera(parameters: Parameters, profile: Profile, constants: Mapping[str, Value]) -> None:

@@ -40,6 +40,8 @@ class Measurement:
     """Modelled times of the steps, seconds."""
     period_s: float = 0.0
     """Time between frames, seconds."""
+    clock_error_ns: int = 0
+    """Time of exposure on the device's clock minus that of the simulation, nanoseconds."""
     late: bool = False
     """Whether the machine took longer than the modelled time."""
 

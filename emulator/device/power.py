@@ -124,6 +124,17 @@ class ThermalState:
         """Return the temperature of detector and lens, °C."""
         return self.mounting_c(now_ns) + self.heating_c(now_ns)
 
+    def mean_c(self, from_ns: int, to_ns: int) -> float:
+        """Return the mean temperature of detector and lens between two simulation times, °C."""
+        config = self.config
+        span_s = (to_ns - from_ns) / NANOSECONDS
+        turn, time_s = 2.0 * math.pi / config.period_s, config.time_constant_s
+        one_s, other_s = ((ns - self.since_ns) / NANOSECONDS for ns in (from_ns, to_ns))
+        swing = math.cos(turn * from_ns / NANOSECONDS) - math.cos(turn * to_ns / NANOSECONDS)
+        fall = math.exp(-max(one_s, 0.0) / time_s) - math.exp(-max(other_s, 0.0) / time_s)
+        heating = self.towards_c + (self.rise_c - self.towards_c) * time_s * fall / span_s
+        return config.mounting_c + config.swing_c * swing / (turn * span_s) + heating
+
 
 class ThermalModel:
     """The thermal state, which a change of the mean power replaces."""

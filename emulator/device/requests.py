@@ -12,7 +12,9 @@ from starhil.emulator.device.counters import Acknowledge
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
+from starhil.emulator.device.signals import Executed
 from starhil.emulator.device.snapshot import Snapshot
+from starhil.emulator.device.telemetry_faults import Hits, TelemetryFaults, with_flaws
 from starhil.emulator.simulation.guard import log_internal_error
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.values import MessageError
@@ -33,6 +35,8 @@ class Requests:
     def __init__(self, device: Device) -> None:
         icd = device.icd
         self.device = device
+        self.faults = TelemetryFaults(icd, device.profile.run.seed)
+        """Faults in the content of telemetry."""
         self.telemetry_bindings = {row.name: TelemetryBinding(row, icd) for row in icd.telemetry.values()}
         self.telecommand_bindings = {
             row.name: TelecommandBinding(row, icd) for row in icd.telecommands.values()
@@ -61,19 +65,30 @@ class Requests:
             if not console:
                 device.counters = device.counters.with_telemetry()
             snapshot = device.snapshot()
-            return self._replies(request, row, self._answer_telemetry(request, row, snapshot), snapshot)
+            hits = self.faults.hits(row, snapshot, counted=not console)
+            reply = self._answer_telemetry(request, row, snapshot, hits)
+            return self._replies(request, row, reply, snapshot, hits)
         row = self._telecommand_rows.get((request.message_class, request.id))
         device.counters = device.counters.with_telecommand()
         outcome = self._execute(request, row)
         if isinstance(outcome, PendingAnswer):
-            return outcome.then(lambda code: self._acknowledge(request, row, code, device.snapshot()))
+
+            def acknowledge(code: ErrorCode) -> list[Reply]:
+                device.signals.executed.emit(Executed(request, row, code, console))
+                return self._acknowledge(request, row, code, device.snapshot())
+
+            return outcome.then(acknowledge)
         code, replies = outcome
+        device.signals.executed.emit(Executed(request, row, code, console))
         snapshot = device.snapshot()
         answered = self._answers_with_data(request, replies, snapshot, code) or self._acknowledge(
             request, row, code, snapshot
         )
-        following = [replace(item, destination=request.source) for item in replies if item.id is not None]
-        return answered + following
+        for item in replies:
+            if item.id is not None:
+                packet = replace(item, destination=request.source)
+                answered += self._flawed(self.faults.hits(row, snapshot, packet=True), packet, snapshot)
+        return answered
 
     def count_fault(self, fault: LinkFault) -> None:
         """Count input on a link that was not a valid request."""
@@ -81,11 +96,14 @@ class Requests:
             log.debug("%s: %s", fault.kind.value, fault.detail)
             self.device.counters = self.device.counters.with_fault(fault)
 
-    def telemetry(self, name: str, snapshot: Snapshot) -> bytes:
-        """Return the data of a telemetry row at one moment; raises Refused if it cannot be read then."""
+    def telemetry(self, name: str, snapshot: Snapshot, hits: Hits = ()) -> bytes:
+        """Return the data of a telemetry row at one moment, with the faults of the message.
+
+        Raises Refused if it cannot be read then.
+        """
         binding = self.telemetry_bindings[name]
         try:
-            data = binding.encode(snapshot)
+            data = self._content(name, snapshot, hits)
             binding.follow(self.device)
         except Refused:
             raise
@@ -94,22 +112,42 @@ class Requests:
             raise Refused(ErrorCode.INTERNAL) from error
         return data
 
+    def _content(self, name: str, snapshot: Snapshot, hits: Hits = ()) -> bytes:
+        """Return the data of a telemetry row at one moment, as faults let the device see it, and change it."""
+        binding = self.telemetry_bindings[name]
+        for hit in hits:
+            snapshot = hit.seen(snapshot)
+        data = binding.encode(snapshot)
+        for hit in hits:
+            data = hit.changed(binding.row, data)
+        return data
+
+    def _flawed(self, hits: Hits, reply: Reply, snapshot: Snapshot) -> list[Reply]:
+        """Return the messages that are sent instead of one that faults affect."""
+        return with_flaws(
+            hits, reply, lambda name: (self.telemetry_bindings[name].row, self._content(name, snapshot))
+        )
+
     def _acknowledge(
         self, request: Request, row: Row | None, code: ErrorCode, snapshot: Snapshot
     ) -> list[Reply]:
         """Return the answers to a telecommand that has been executed or refused."""
-        return self._replies(request, row, self._answer(request, snapshot, code), snapshot)
+        hits = self.faults.hits(row, snapshot)
+        return self._replies(request, row, self._answer(request, snapshot, code), snapshot, hits)
 
-    def _replies(self, request: Request, row: Row | None, reply: Reply, snapshot: Snapshot) -> list[Reply]:
+    def _replies(
+        self, request: Request, row: Row | None, reply: Reply, snapshot: Snapshot, hits: Hits
+    ) -> list[Reply]:
         """Return the answers of a row in order, including its reply or refusal, all of one moment."""
+        own = self._flawed(hits, reply, snapshot)
         if row is None or row.answers == ("reply",):
-            return [reply]
+            return own
         replies: list[Reply] = []
         for answer in row.answers:
             if answer == "echo":
                 replies.append(Reply.echo(request))
             elif answer == "reply":
-                replies.append(reply)
+                replies += own
             elif reply.kind is not ReplyKind.NACK:
                 other = self.device.icd.telemetry[answer.partition(":")[2]]
                 as_request = replace(
@@ -119,7 +157,10 @@ class Requests:
                     message_class=other.message_class,
                     data=b"",
                 )
-                replies.append(self._answer_telemetry(as_request, other, snapshot))
+                hits = self.faults.hits(other, snapshot)
+                replies += self._flawed(
+                    hits, self._answer_telemetry(as_request, other, snapshot, hits), snapshot
+                )
         return [replace(item, final=item is replies[-1]) for item in replies]
 
     def _answers_with_data(
@@ -133,13 +174,13 @@ class Requests:
             for number, item in enumerate(data, 1)
         ]
 
-    def _answer_telemetry(self, request: Request, row: Row | None, snapshot: Snapshot) -> Reply:
+    def _answer_telemetry(self, request: Request, row: Row | None, snapshot: Snapshot, hits: Hits) -> Reply:
         if row is None:
             return self._answer(request, snapshot, ErrorCode.INVALID_ID)
         if request.data:
             return self._answer(request, snapshot, ErrorCode.INVALID_LENGTH)
         try:
-            data = self.telemetry(row.name, snapshot)
+            data = self.telemetry(row.name, snapshot, hits)
         except Refused as refused:
             return self._answer(request, snapshot, refused.code)
         return self._reply(request, snapshot, ReplyKind.TELEMETRY, data)
@@ -221,13 +262,15 @@ class Requests:
         host = int(device.parameters["host_address"])
         snapshot = device.snapshot()
         for row in rows:
+            hits = self.faults.hits(row, snapshot)
             try:
-                data = self.telemetry(row.name, snapshot)
+                data = self.telemetry(row.name, snapshot, hits)
             except Refused:  # the row cannot be read now, for example while an image is being opened
                 continue
             reply = Reply(
                 ReplyKind.UNSOLICITED, row.id, data, destination=host, message_class=row.message_class
             )
-            device.signals.unsolicited.emit(self._with_times(reply, snapshot))
+            for item in self._flawed(hits, self._with_times(reply, snapshot), snapshot):
+                device.signals.unsolicited.emit(item)
             if row.action is not None:
                 snapshot = device.snapshot()  # after the action that follows the reading of the row

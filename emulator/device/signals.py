@@ -7,7 +7,7 @@
     parameters ──parameters_changed──► device, subscriptions, links
     device ──started──► subscriptions, serial link          device ──restarted──► links, head, revival of the pipeline
     subscriptions ──rows_due──► requests    requests ──unsolicited──► links
-    faults ──faults_changed──► recording
+    faults ──faults_changed──► recording, console    requests ──executed──► events of console and recording
 
 Two parts that do not depend on the device have signals elsewhere: `Scheduler.added` wakes a sleeping pump, and
 `SensorPipeline.ended` starts the pipeline again.
@@ -27,7 +27,19 @@ from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
 from starhil.emulator.simulation.signal import Signal
 from starhil.protocol.icd.codec import Row
-from starhil.protocol.messages import Reply
+from starhil.protocol.messages import ErrorCode, Reply, Request
+
+
+@dataclass(frozen=True)
+class Executed:
+    """A telecommand was executed or refused."""
+
+    request: Request
+    row: Row | None
+    """None: there is no such telecommand."""
+    code: ErrorCode
+    console: bool
+    """Whether it came on the line of console and recording."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +56,7 @@ class Signals:
     """The device was switched on or reset, and has set parameters and time; the cause."""
     restarted: Signal[str] = field(default_factory=lambda: Signal("reset"))
     """A reset is complete; the cause."""
+    executed: Signal[Executed] = field(default_factory=lambda: Signal("telecommand"))
     rows_due: Signal[Sequence[Row]] = field(default_factory=lambda: Signal("unsolicited rows"))
     """Telemetry rows of one moment are due to be sent unsolicited, in this order."""
     faults_changed: Signal[dict[str, Any]] = field(default_factory=lambda: Signal("faults"))

@@ -34,6 +34,8 @@ class ConsoleOptions:
     """Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT."""
     view_token: str = ""
     """Token of pages that may look but not command; empty for none."""
+    command_token: str = ""
+    """Token of pages that may command; empty: a random one."""
     files: tuple[Path, ...] = ()
     """Files of recorders (`RECORDERS`); each is one file per head (`path_of_head`)."""
 
@@ -128,6 +130,7 @@ class Emulator:
             for head in run.heads:
                 events = scenario.prepare(head, run.truth if head.number == 1 else None)
                 head.device.scheduler.add(events)
+                head.foreseen += scenario.skies
         if options.control != "off" or options.console is not None:
             self.control = ControlServer(run, self.ended.set, options.control_token)
             if options.control != "off":
@@ -188,13 +191,15 @@ class Emulator:
 
     async def _open_console(self, options: ConsoleOptions, control: ControlServer) -> None:
         """Open console and recorders, with an OBC on the bus of each head."""
+        from starhil.emulator.console.events import EventLog
         from starhil.emulator.console.obc_link import open_obc
 
+        logs = [EventLog(head) for head in self.run.heads]
         clients = [await open_obc(head, options.make_client, self._closers) for head in self.run.heads]
         for file in options.files:
-            for head, client in zip(self.run.heads, clients, strict=True):
+            for head, client, events in zip(self.run.heads, clients, logs, strict=True):
                 path = path_of_head(file, head.number)
-                recorder = RECORDERS[file.suffix].make(head, client, path, self.options.overwrite)
+                recorder = RECORDERS[file.suffix].make(head, client, events, path, self.options.overwrite)
                 self._closers.append(recorder.close)
                 self._files.append(recorder.file)
                 recorder.start()
@@ -208,11 +213,11 @@ class Emulator:
             self._closers.append(stepping.pause)
             consoles = []
             for head, client in zip(self.run.heads, clients, strict=True):
-                console = Console(self.run, head, client, stepping, runs)
+                console = Console(self.run, head, client, logs, stepping, runs)
                 self._closers.append(console.close)
                 console.start()
                 consoles.append(console)
-            server = ConsoleServer(consoles, options.view_token)
+            server = ConsoleServer(consoles, options.view_token, options.command_token)
             self._closers.append(server.close)
             self.ready_fields |= await server.start(options.view)
 

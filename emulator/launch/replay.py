@@ -29,6 +29,7 @@ from starhil.emulator.run.recorder import (
     Done,
 )
 from starhil.emulator.run.tape import (
+    AwaitedPhase,
     ClearedFaults,
     End,
     Entry,
@@ -38,6 +39,7 @@ from starhil.emulator.run.tape import (
     LinkItem,
     NewFaults,
     NewTruth,
+    Note,
     PipelineAnswer,
     PipelineState,
     Stored,
@@ -323,12 +325,16 @@ class _Playing:
                 if not player.writes:
                     raise _DeviationError("nothing is being written")
                 player.writes.popleft()()
+            case Note():
+                pass
             case End():
                 self.ended = True
             case _:
                 await self._play_input(entry)
 
-    async def _play_input(self, entry: LinkItem | FeedMessage | NewTruth | NewFaults | ClearedFaults) -> None:
+    async def _play_input(
+        self, entry: LinkItem | FeedMessage | NewTruth | NewFaults | ClearedFaults | AwaitedPhase
+    ) -> None:
         """Play what came from outside, as `_play` does."""
         match entry:
             case LinkItem():
@@ -347,3 +353,5 @@ class _Playing:
                 self.head.faults.inject(entry.request)
             case ClearedFaults():
                 self.head.faults.clear()
+            case AwaitedPhase():
+                self.head.device.cycle.at_phase(entry.phase, lambda _due_ns: None)

@@ -73,6 +73,11 @@ class Link(ABC, Generic[Item]):
         return None
 
     @property
+    def shown_in_replies(self) -> frozenset[str]:
+        """What its messages carry besides data: `id`, `sequence`, `check`."""
+        return frozenset(("id", "sequence"))
+
+    @property
     def ready_fields(self) -> dict[str, str]:
         """Fields of the ready line, once the transport is open."""
         return {self.bus: self.transport.description}

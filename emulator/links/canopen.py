@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import ClassVar, Final, TypeAlias
@@ -15,15 +16,16 @@ from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.snapshot import Snapshot
+from starhil.emulator.device.telemetry_faults import Hits, TelemetryFault
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import Link
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanDamage
 from starhil.emulator.sensor.pipeline.messages import ImageResult
-from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.can.frame import MAX_STANDARD_ID, CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
-from starhil.protocol.canopen.cob import SDO_RECEIVE
+from starhil.protocol.canopen.cob import SDO_RECEIVE, SDO_TRANSMIT
 from starhil.protocol.canopen.context import UNCONFIGURED_NODE, EventKind, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.dictionary import Deferred
@@ -48,6 +50,12 @@ FRAME_QUANTITIES: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
 one of them."""
 STATUS_QUANTITY: Final = "mode"
 """TPDOs that map a row with this quantity are triggered when it or the validity of the attitude changes."""
+
+SDO_SEGMENT: Final = 0
+SDO_UPLOAD: Final = 2
+SDO_INITIATED: Final = (SDO_UPLOAD, 3, 4, 6)
+"""Server command specifiers: a segment of an upload, and the answers that begin or refuse a transfer."""
+SDO_TOGGLE: Final = 0x10
 
 Action: TypeAlias = Callable[..., list[CanFrame]]
 """An action of the slave at a time, its argument `now`, seconds."""
@@ -74,14 +82,16 @@ def not_before(deadline: float) -> int:
 class DeviceSample:
     """The device at one moment, `starhil.protocol.canopen.application.Sample`."""
 
-    def __init__(self, requests: Requests, snapshot: Snapshot) -> None:
+    def __init__(self, requests: Requests, snapshot: Snapshot, hits: dict[str, Hits]) -> None:
         self._requests = requests
         self._shot = snapshot
+        self._hits = hits
 
     def telemetry(self, row: Row) -> bytes:
         """Return the bytes of a telemetry row."""
+        hits = self._hits[row.name] = self._requests.faults.hits(row, self._shot)
         try:
-            return self._requests.telemetry(row.name, self._shot)
+            return self._requests.telemetry(row.name, self._shot, hits)
         except Refused as refused:
             check_status(refused.code, row.name)
             raise
@@ -99,6 +109,8 @@ class DeviceApplication:
         self._device = requests.device
         self._finish_write = finish
         self._last_image: GreyImage | None = None
+        self.hits: dict[str, Hits] = {}
+        """Faults of the rows that were read in this sampling instant."""
 
     def clear(self) -> None:
         """Discard the captured image, because the device has restarted."""
@@ -106,7 +118,7 @@ class DeviceApplication:
 
     def sample(self) -> DeviceSample:
         """Return the device at this moment."""
-        return DeviceSample(self._requests, self._device.snapshot())
+        return DeviceSample(self._requests, self._device.snapshot(), self.hits)
 
     def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
         """Execute a telecommand, which is counted and acknowledged as on the other links."""
@@ -214,6 +226,8 @@ class CanopenLink(Link[CanFrame]):
         )
         self._attitude_valid = False
         self._reconnects = 0
+        self._sdo_hits: Hits = ()
+        """Faults of the row that the last SDO transfer reads."""
         self._node = BusAddress("node", "links.canopen.node")
         device.signals.frame_published.connect(self._frame_published)
         device.signals.mode_changed.connect(self._mode_changed)
@@ -256,15 +270,54 @@ class CanopenLink(Link[CanFrame]):
         self._busy = True
         try:
             while self._actions:
+                self.application.hits = {}
                 frames = self._actions.popleft()(now=self._now())
                 if not self._device.unresponsive:
                     for frame in frames:
-                        self.wire.send(frame)
+                        for sent in self._with_faults(frame):
+                            self.wire.send(sent)
                 for event in self.slave.take_events():
                     self._handle_event(event)
         finally:
             self._busy = False
         self._schedule_tick()
+
+    def _with_faults(self, frame: CanFrame) -> list[CanFrame]:
+        """Return the frames that are sent instead of an SDO answer or a TPDO with a row that faults affect."""
+        hits = self.application.hits
+        if frame.id == SDO_TRANSMIT + self.slave.node_id:
+            if frame.data[0] >> 5 in SDO_INITIATED:
+                self._sdo_hits = [hit for found in hits.values() for hit in found]
+            affecting = self._sdo_hits
+        else:
+            affecting = self._hits_of_pdo(frame.id) if any(hits.values()) else ()
+        frames = [frame]
+        for hit in affecting:
+            frames = [new for each in frames for new in self._with_fault(hit.fault, each)]
+        return frames
+
+    def _hits_of_pdo(self, can_id: int) -> Hits:
+        keys = self.slave.pdos.mapped_by(can_id)
+        found = self.application.hits.items()
+        return [hit for row, hits in found if keys & self._dictionary.sources.get(row, set()) for hit in hits]
+
+    def _with_fault(self, fault: TelemetryFault, frame: CanFrame) -> list[CanFrame]:
+        """Return the frames that are sent instead of one that a fault affects."""
+        data, sdo = frame.data, frame.id == SDO_TRANSMIT + self.slave.node_id
+        if fault.drop:
+            return []
+        if fault.answer_with is not None and sdo and data[0] >> 5 == SDO_UPLOAD:
+            (index, subindex), _ = self._dictionary.entries_of(self._device.icd.telemetry[fault.answer_with])[
+                0
+            ]
+            data = data[:1] + index.to_bytes(2, "little") + bytes((subindex,)) + data[4:]
+        if fault.wrong_sequence and sdo and data[0] >> 5 == SDO_SEGMENT:
+            data = bytes((data[0] ^ SDO_TOGGLE,)) + data[1:]
+        if fault.truncate:
+            data = data[: -fault.truncate]
+        number = frame.id if fault.wrong_id is None else fault.wrong_id & MAX_STANDARD_ID
+        flawed = replace(frame, id=number, data=data)
+        return [flawed, flawed] if fault.duplicate else [flawed]
 
     def _schedule_tick(self) -> None:
         """Schedule a tick at the next deadline of the slave, unless an earlier one is already scheduled."""

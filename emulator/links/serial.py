@@ -90,6 +90,11 @@ class SerialLink(RequestLink[bytes, SerialStyle]):
         return SerialStyle(dialect, int(parameters["serial_baud"]))
 
     @property
+    def shown_in_replies(self) -> frozenset[str]:
+        """What its messages carry besides data, in some dialect."""
+        return self._stack.shown_in_replies
+
+    @property
     def ready_fields(self) -> dict[str, str]:
         """Fields of the ready line, with the dialect at the start."""
         dialect = {} if self.dialect is None else {"dialect": self.dialect.value}

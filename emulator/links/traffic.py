@@ -9,21 +9,27 @@ from functools import partial
 from typing import Any, Final
 
 from starhil.emulator.links.base import AnyLink
+from starhil.emulator.links.canopen_trace import CanopenDecoder
 from starhil.emulator.simulation.signal import Signal
 from starhil.protocol.can.cubespace import REQUEST_KINDS, CanDeviceReceiver, CanHostReceiver, CanId
 from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.values import Value
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.serial.framings import Deframer
 from starhil.protocol.serial.stack import HostReceiver, SerialStack
 
 SHOWN_VALUES: Final = 8
 
 CONSOLE_ADDRESS: Final = 253
 """CAN address of the OBC of console and recording, by which its own requests are recognised."""
+
+CONSOLE_BUS: Final = "console"
+"""Name of the line or bus that console and recording have to themselves."""
 
 MAX_ADDRESSES: Final = 64
 """Maximum number of addresses whose segments are joined: a link fault can cause many random CAN IDs."""
@@ -43,7 +49,7 @@ class WireItem:
     at_s: float
     """Unix time."""
     bus: str
-    """`serial` or `can`."""
+    """`serial`, `can`, or `console` for the line or bus that the console has to itself."""
     outgoing: bool
     item: bytes | CanFrame
 
@@ -58,12 +64,13 @@ class Traffic:
         self.passed: Signal[WireItem] = Signal("traffic")
         self._buses: set[str] = set()
 
-    def add(self, link: AnyLink) -> None:
-        """Report the items of a link."""
-        link.wire.listener = partial(self._report, link.bus, True)  # noqa: FBT003 (outgoing)
-        if link.bus not in self._buses:
-            self._buses.add(link.bus)
-            link.transport.listener = partial(self._report, link.bus, False)  # noqa: FBT003 (incoming)
+    def add(self, link: AnyLink, bus: str = "") -> None:
+        """Report the items of a link, under the name of its bus or another one."""
+        bus = bus or link.bus
+        link.wire.listener = partial(self._report, bus, True)  # noqa: FBT003 (outgoing)
+        if bus not in self._buses:
+            self._buses.add(bus)
+            link.transport.listener = partial(self._report, bus, False)  # noqa: FBT003 (incoming)
 
     def _report(self, bus: str, outgoing: bool, item: bytes | CanFrame) -> None:
         if self.passed.observers:
@@ -71,20 +78,27 @@ class Traffic:
 
 
 class Decoder:
-    """Decodes the items of a trace, in order."""
+    """Decodes the items of a trace, in order; CANopen by names and values if the dictionary of `objects` is given."""
 
-    def __init__(self, icd: InterfaceDefinition, dialect: Callable[[], Dialect | None]) -> None:
+    def __init__(
+        self,
+        icd: InterfaceDefinition,
+        dialect: Callable[[], Dialect | None],
+        objects: DeviceDictionary | None = None,
+    ) -> None:
         self._icd = icd
         self._dialect = dialect
+        self._canopen = None if objects is None else CanopenDecoder(objects)
         self._stack = SerialStack(icd) if icd.link.serial is not None else None
-        self._to_device = self._stack.device() if self._stack is not None else None
-        self._from_device: tuple[Dialect | None, HostReceiver] | None = None
+        self._to_device: dict[str, Deframer[Request]] = {}
+        """Receivers of requests by the name of the line."""
+        self._from_device: dict[str, tuple[Dialect | None, HostReceiver]] = {}
         self._can: dict[tuple[bool, int], CanDeviceReceiver | CanHostReceiver] = {}
 
     def line(self, entry: WireItem) -> dict[str, Any]:
         """Decode one item to a line of the trace, as JSON data."""
-        events, item, own = self.events(entry), entry.item, False
-        found = [self._text(event) for event in events] or [("part", self._part(item))]
+        events, item, own = self.events(entry), entry.item, entry.bus == CONSOLE_BUS
+        found = [self._text(event) for event in events] or [self._part(item)]
         kind, text = found[-1][0], "; ".join(text for _, text in found)
         if isinstance(item, CanFrame):
             raw = str(item)
@@ -92,8 +106,6 @@ class Decoder:
                 can_id = CanId.unpack(item.id)
                 text = f"{can_id.source}→{can_id.destination} {text}"
                 own = CONSOLE_ADDRESS in (can_id.source, can_id.destination)
-            elif not item.extended:
-                kind = "canopen"
         else:
             raw = item.hex(" ").upper()
         return {
@@ -110,20 +122,21 @@ class Decoder:
         """Return the messages that are complete with an item; none in 11-bit CAN frames."""
         if isinstance(entry.item, CanFrame):
             return self._can_events(entry.item, entry.at_s)
-        return self._serial_events(entry.item, entry.at_s, outgoing=entry.outgoing)
+        return self._serial_events(entry, entry.item)
 
-    def _serial_events(
-        self, data: bytes, now: float, *, outgoing: bool
-    ) -> Sequence[Request | Reply | LinkFault]:
-        if self._stack is None or self._to_device is None:
+    def _serial_events(self, entry: WireItem, data: bytes) -> Sequence[Request | Reply | LinkFault]:
+        stack, line, now = self._stack, entry.bus, entry.at_s
+        if stack is None:
             return ()
         dialect = self._dialect()
-        if self._from_device is None or self._from_device[0] is not dialect:
-            self._from_device = (dialect, self._stack.host(dialect))
-        host = self._from_device[1]
-        if outgoing:
+        if line not in self._from_device or self._from_device[line][0] is not dialect:
+            self._from_device[line] = (dialect, stack.host(dialect))
+        host = self._from_device[line][1]
+        if entry.outgoing:
             return host.feed(data, now)
-        requests = self._to_device.feed(data, now)
+        if line not in self._to_device:
+            self._to_device[line] = stack.device()
+        requests = self._to_device[line].feed(data, now)
         for event in requests:
             if isinstance(event, Request):
                 host.overhear(event)
@@ -141,17 +154,17 @@ class Decoder:
             self._can[key] = (CanDeviceReceiver if request else CanHostReceiver)(can_id.destination)
         return self._can[key].feed(frame, now)
 
-    def _part(self, item: bytes | CanFrame) -> str:
-        """Return the text of an item without a complete message."""
+    def _part(self, item: bytes | CanFrame) -> tuple[str, str]:
+        """Return kind and text of an item without a complete message."""
         if not isinstance(item, CanFrame):
-            return "bytes" if self._stack is None else "part of a message"
+            return "part", "bytes" if self._stack is None else "part of a message"
         if not item.extended:
-            return canopen_text(item)
+            return ("canopen", canopen_text(item)) if self._canopen is None else self._canopen.line(item)
         if self._icd.link.can is None:
-            return "29-bit frame"
+            return "part", "29-bit frame"
         number = CanId.unpack(item.id).id
         row = self._icd.row(number)
-        return f"segment of {row.name if row is not None else number}"
+        return "part", f"segment of {row.name if row is not None else number}"
 
     def row_of(self, message: Request | Reply) -> Row | None:
         """Return the row of a message by class and ID, or by ID alone if it has no class."""
@@ -165,15 +178,15 @@ class Decoder:
         if isinstance(event, Request):
             if event.kind is RequestKind.TELEMETRY:
                 return "telemetry", f"{name}?"
-            return "telecommand", f"{name}{_values(row, event.data)}"
+            return "telecommand", f"{name}{values_text(row, event.data)}"
         if event.kind is ReplyKind.NACK:
             return "nack", f"{name} refused: {self._icd.error_name(int(event.code))}"
         if event.kind is ReplyKind.ACK:
             return "ack", f"{name} accepted"
-        return "reply", f"{name}{_values(row, event.data)}"
+        return "reply", f"{name}{values_text(row, event.data)}"
 
 
-def _values(row: Row | None, data: bytes) -> str:
+def values_text(row: Row | None, data: bytes) -> str:
     """Format the first values of a row."""
     if row is None or not data:
         return ""

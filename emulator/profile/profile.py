@@ -23,6 +23,7 @@ from starhil.emulator.profile.sections import (
     CalibrationConfig,
     CameraConfig,
     CatalogConfig,
+    ClockConfig,
     DeviceConfig,
     ImagesConfig,
     LinksConfig,
@@ -89,6 +90,8 @@ class Profile(Strict):
     """Identification and boot."""
     timing: TimingConfig = TimingConfig()
     """Modelled processing times."""
+    clock: ClockConfig = ClockConfig()
+    """Errors of the clock and of the latency."""
     power: PowerConfig = PowerConfig()
     """Currents by phase."""
     thermal: ThermalConfig = ThermalConfig()
@@ -177,7 +180,7 @@ _LONGEST_SHOWN: Final = 200
 
 _A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
 FAULT_KEY_HINTS: Final = dict.fromkeys(
-    ("fault", "faults", "optical", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
+    ("fault", "faults", "optical", "telemetry", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
      "delay_s", "split", "gap_s"),
     _A_FAULT,
 )  # fmt: skip

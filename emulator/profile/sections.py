@@ -18,6 +18,12 @@ FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
 Milliamperes = Annotated[float, Field(ge=0.0, le=10_000.0)]
 
 ParticleRate = Annotated[float, Field(ge=0.0, le=1e6)]
+Drift = Annotated[float, Field(ge=-1e5, le=1e5)]
+"""Parts per million."""
+DriftByTemperature = Annotated[float, Field(ge=-1e3, le=1e3)]
+"""Parts per million and degree."""
+Jitter = Annotated[float, Field(ge=0.0, le=60.0)]
+"""Seconds."""
 FocalLength = Annotated[float, Field(ge=1.0, le=1e6)]
 PixelPosition = Annotated[float, Field(ge=-1e4, le=1e4)]
 DistortionTerm = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -212,6 +218,19 @@ class ImagesConfig(Strict):
             if (value := getattr(self, key))
         }
         return {**self.model_dump(), "capture": str(self.capture), **files}
+
+
+class ClockConfig(Strict):
+    """Errors of the device's clock, and of the time that a result takes."""
+
+    drift_ppm: Drift = 0.0
+    """Drift of the clock at 25 °C, parts per million; positive: it is fast."""
+    drift_ppm_c: DriftByTemperature = 0.0
+    """Change of the drift per degree of the detector's temperature."""
+    jitter_s: Jitter = 0.0
+    """Standard deviation of the time tags of exposures, seconds."""
+    latency_jitter_s: Jitter = 0.0
+    """Largest additional delay of a result; its delays are uniform from 0 to this."""
 
 
 class TimingConfig(Strict):

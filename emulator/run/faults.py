@@ -1,4 +1,4 @@
-"""Fault injection at three levels: optical, device and link."""
+"""Fault injection at four levels: optical, device, telemetry and link."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
+from starhil.emulator.device.clock_errors import NO_FAULT, ClockFault
+from starhil.emulator.device.cycle import Phase
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.parameters import memory_bits
+from starhil.emulator.device.requests import Requests
+from starhil.emulator.device.telemetry_faults import MAX_FAULTS, TelemetryFault
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import AnyLink
+from starhil.emulator.links.table import BUSES
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.sensor.pipeline.messages import DIRECTION_BITS, CatalogUpset
 from starhil.emulator.sensor.sky.tables import OPTICAL_FAULT
@@ -148,12 +153,27 @@ EFFECTS: Final[Mapping[str, Effect]] = {
 """Effects of the keys of `DeviceFault`."""
 
 
+def as_list(value: Any) -> Any:
+    """Return a list of a single table."""
+    return [value] if isinstance(value, dict) else value
+
+
 class FaultRequest(Strict):
     """One `fault` request; omitted levels keep their faults."""
+
+    phase: Phase | None = None
+    """Inject at the begin, the middle or the end of the next exposure that begins; omitted: now."""
 
     optical: Annotated[dict[str, Any], TableOf(OPTICAL_FAULT)] | None = None
     """Objects in addition to the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
     device: DeviceFault | None = None
+    """Fault of the device."""
+    telemetry: (
+        Annotated[list[TelemetryFault], BeforeValidator(as_list), Field(max_length=MAX_FAULTS)] | None
+    ) = None
+    """Faults in the content of telemetry: a table, or a list of them."""
+    clock: ClockFault | None = None
+    """Faults of the device's clock, and of the latency."""
     serial: WireFault | None = None
     can: WireFault | None = None
     """Faults of outgoing CAN frames, including CANopen."""
@@ -162,10 +182,6 @@ class FaultRequest(Strict):
         """Return the faults of a bus, whose key is its name; None if they stay."""
         fault: WireFault | None = getattr(self, bus)
         return fault
-
-
-BUSES: Final = tuple(name for name in FaultRequest.model_fields if name not in ("optical", "device"))
-"""Names of the buses that faults can affect."""
 
 
 def _values(fault: DeviceFault) -> Iterator[tuple[str, Effect, Any]]:
@@ -178,20 +194,36 @@ def _values(fault: DeviceFault) -> Iterator[tuple[str, Effect, Any]]:
 class Faults:
     """The currently injected faults, also of links that are opened later."""
 
-    def __init__(self, device: Device, links: Mapping[str, AnyLink]) -> None:
-        self._device = device
+    def __init__(self, requests: Requests, links: Mapping[str, AnyLink]) -> None:
+        self._device = requests.device
+        self._telemetry = requests.faults
         self._links = links
+        self._cleared = 0
+        """How often all faults were ended."""
 
     @property
     def _wires(self) -> list[tuple[str, WireFaults[Any]]]:
         return [(link.bus, link.wire) for link in self._links.values()]
 
     def inject(self, request: FaultRequest) -> None:
-        """Inject the faults of a request, all or none."""
+        """Inject the faults of a request, all or none, now or at its phase."""
         self.check(request)
+        if request.phase is None:
+            self._inject(request)
+        else:
+            cleared = self._cleared
+            self._device.cycle.at_phase(
+                request.phase, lambda _due_ns: self._inject(request) if cleared == self._cleared else None
+            )
+
+    def _inject(self, request: FaultRequest) -> None:
         device = self._device
         if request.optical is not None:
             device.surroundings.faults = dict(request.optical)
+        if request.telemetry is not None:
+            self._telemetry.inject(request.telemetry, device.clock.now_ns())
+        if request.clock is not None:
+            device.fail_clock(request.clock)
         for name, wire in self._wires:
             fault = request.of_bus(name)
             if fault is not None:
@@ -210,6 +242,9 @@ class Faults:
                     near = did_you_mean(value, known)
                     raise EmulatorError(f"device.{key}: {value!r} is not one of {', '.join(known)}{near}")
                 effect.check(self._device, value)
+        shown = {name: link.shown_in_replies for name, link in self._links.items()}
+        for fault in request.telemetry or ():
+            self._telemetry.check(fault, shown)
         there = {name for name, _ in self._wires}
         for name in BUSES:
             if request.of_bus(name) is not None and name not in there:
@@ -218,9 +253,15 @@ class Faults:
                 )
 
     def clear(self) -> None:
-        """End all faults; the error mode ends only by telecommand, and flipped parameters by a restart."""
+        """End all faults, and those that wait for their phase.
+
+        The error mode ends only by telecommand, and flipped parameters by a restart.
+        """
+        self._cleared += 1
         device = self._device
         device.surroundings.faults = {}
+        self._telemetry.inject((), device.clock.now_ns())
+        device.fail_clock(NO_FAULT)
         for effect in EFFECTS.values():
             effect.end(device)
         for _, wire in self._wires:
@@ -234,6 +275,10 @@ class Faults:
             active["optical"] = self._device.surroundings.faults
         if of_device := {k: v for effect in EFFECTS.values() for k, v in effect.active(self._device).items()}:
             active["device"] = of_device
+        if faults := self._telemetry.settings:
+            active["telemetry"] = [fault.model_dump(exclude_unset=True) for fault in faults]
+        if of_clock := self._device.clock_errors.fault.lasting:
+            active["clock"] = of_clock
         for name, wire in self._wires:
             if not wire.settings.none:
                 active[name] = wire.settings.model_dump()

@@ -13,13 +13,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any, Final
 from urllib.parse import quote
 
-from starhil.emulator.device.device import Background, Device, outcome, run_at_once
+from starhil.emulator.device.device import Background, Device, constants_to_adopt, outcome, run_at_once
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.requests import Requests
@@ -35,15 +38,19 @@ from starhil.emulator.run.pump import ClockPump
 from starhil.emulator.run.revival import PipelineRevival
 from starhil.emulator.run.tape import PipelineState
 from starhil.emulator.run.wiring import Wiring
-from starhil.emulator.sensor.pipeline.messages import PipelineReady, camera_constants
+from starhil.emulator.sensor.pipeline.messages import IndexRequest, PipelineReady, camera_constants
 from starhil.emulator.simulation.clock import Clock
 from starhil.emulator.simulation.guard import close_all
 from starhil.emulator.truth.truth import SensorTruth, Truth
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd.values import Value
 from starhil.protocol.serial.cubespace import Dialect
 
 log = logging.getLogger("starhil.run")
+
+NOTICED_S: Final = 0.5
+"""Shortest time for which simulation time stands that is logged, seconds."""
 
 
 class Head:
@@ -72,6 +79,10 @@ class Head:
         self.traffic = Traffic()
         self.ready_fields: dict[str, str] = {}
         """Fields of the ready line: the opened ports and buses."""
+        self.foreseen: list[Mapping[str, Any]] = []
+        """Optical faults for which the pipeline is prepared at the start, such as those of a scenario."""
+        self._rehearsed: set[frozenset[str]] = set()
+        """Kinds of optical faults for which it is prepared."""
         self.warm: PipelineReady | None = None
         """What the pipeline reported when it was last ready; None before."""
         self._wiring = wiring
@@ -96,7 +107,7 @@ class Head:
                 wiring.background(background),
             )
             self.requests = Requests(self.device)
-            self.faults = Faults(self.device, self.links)
+            self.faults = Faults(self.requests, self.links)
             self.device.signals.frame_published.connect(_log_frame)
             self.device.power_on()
         except EmulatorError:
@@ -153,16 +164,52 @@ class Head:
         try:
             warm = await self.imager.start()
             log.info("pipeline ready: %d stars, %.2f s", warm.stars, warm.seconds)
+            prepared = await self._rehearse(camera_constants(warm.camera), [{}, *self.foreseen])
             self._record("ready")
             device.signals.mode_changed.connect(self._mode_changed)
             device.signals.restarted.connect(self._device_reset)
-            self.pipeline_ready(warm)
+            self._adopt(warm)
+            if self.device.cycle.index_request() != prepared:  # the OBC has set parameters during the boot
+                self._prepare_index()
+            self._on_warm()
         except EmulatorError as error:
             raise EmulatorError(f"{self.profile.source_of(error)}: {error}") from None
         except ProtocolError as error:  # a camera constant is outside the limits of its parameter
             raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None
         if self.clock.stepped or device.modes.mode is not Mode.BOOT:
             self._awake.set()
+
+    async def _rehearse(
+        self, constants: dict[str, Value], skies: Sequence[Mapping[str, Any]]
+    ) -> IndexRequest:
+        """Let the pipeline prepare frames under these optical faults, and wait until it has; return the request for their index."""
+        device = self.device
+        adopted = constants_to_adopt(device.parameters, self.profile, constants)
+        self._rehearsed |= {_kinds_of(sky) for sky in skies}
+        request = device.cycle.rehearsals(adopted, skies)
+        self.imager.prepare(request)
+        await self.imager.settle()
+        return replace(request, rehearsals=())
+
+    async def prepare_sky(self, sky: Mapping[str, Any]) -> None:
+        """Prepare the pipeline for an optical fault of a kind that nobody foresaw: no frame is lost while kernels are compiled.
+
+        Meanwhile simulation time stands, on every clock.
+        """
+        if self.warm is None or _kinds_of(sky) in self._rehearsed or self.clock.stepped:
+            return
+        begun_s = time.monotonic()
+        held = self.clock.running.hold()
+        try:
+            await self._rehearse({}, [sky])
+        finally:
+            if held:
+                self.clock.start()
+        held_s = time.monotonic() - begun_s
+        if held_s > NOTICED_S:
+            log.info(
+                "optical fault: simulation time stood for %.1f s while the pipeline was prepared", held_s
+            )
 
     def _record(self, kind: str) -> None:
         self._wiring.enter(PipelineState, do=kind)
@@ -173,10 +220,13 @@ class Head:
 
     def pipeline_ready(self, warm: PipelineReady) -> None:
         """Pass the camera of a ready pipeline to the device, and the device's parameters to the pipeline."""
-        self.warm = warm
-        self.device.pipeline_ready(camera_constants(warm.camera))
+        self._adopt(warm)
         self._prepare_index()
         self._on_warm()
+
+    def _adopt(self, warm: PipelineReady) -> None:
+        self.warm = warm
+        self.device.pipeline_ready(camera_constants(warm.camera))
 
     def _prepare_index(self) -> None:
         """Have the star index built for the parameters with which the device starts, before its first frame."""
@@ -226,6 +276,12 @@ class Head:
         """Wait for the writes in progress, and for their outcomes, which arrive in the event loop."""
         self._writer.shutdown(wait=True)
         await asyncio.sleep(0)
+
+
+def _kinds_of(sky: Mapping[str, Any]) -> frozenset[str]:
+    """Return the keys of an optical fault, and the keys in its tables."""
+    inner = {f"{name}.{key}" for name, table in sky.items() if isinstance(table, Mapping) for key in table}
+    return frozenset(sky) | inner
 
 
 async def _cancel(task: asyncio.Task[None]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 from starhil.emulator.errors import EmulatorError
@@ -112,8 +112,11 @@ class StepPump:
         """Run no more events; a step in progress is cancelled."""
         self._stopped = True
 
-    async def step(self, seconds: float) -> int:
-        """Advance simulation time; on return, all events within the step are done. Return their number."""
+    async def step(self, seconds: float, until: Callable[[], bool] = lambda: False) -> int:
+        """Advance simulation time, at most to the event after which `until` holds.
+
+        On return, all events within the step are done. Return their number.
+        """
         if not 0.0 < seconds <= MAX_STEP_S:
             raise EmulatorError(f"step: must be seconds in (0, {MAX_STEP_S:g}], not {seconds}")
         await self._time_passes.wait()
@@ -127,6 +130,8 @@ class StepPump:
                 self._wiring.write(EventEntry)
                 call_guarded("event", event.action, event.due_ns)
                 await self._settle()
+                if until():
+                    return events
             self._clock.set_ns(end_ns)
             return events
 

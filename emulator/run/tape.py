@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import json
 from functools import cached_property
-from typing import Annotated, Literal, Self, TypeAlias
+from typing import Annotated, Final, Literal, Self, TypeAlias
 
 from pydantic import Field, RootModel, field_serializer, model_validator
 
+from starhil.emulator.device.cycle import Phase
 from starhil.emulator.links.table import LINKS, LinkName
 from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.simulation.config_model import Strict
 from starhil.emulator.truth.config import TruthConfig
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
+
+LONGEST_NOTE: Final = 500
+"""Longest note, characters."""
 
 
 class TimedEntry(Strict):
@@ -117,6 +121,20 @@ class ClearedFaults(TimedEntry):
     do: Literal["clear_faults"] = "clear_faults"
 
 
+class AwaitedPhase(TimedEntry):
+    """A wait for a phase of the next exposure, which is an event of the device."""
+
+    do: Literal["wait"] = "wait"
+    phase: Phase
+
+
+class Note(TimedEntry):
+    """A note of somebody who watches the run; it changes nothing."""
+
+    do: Literal["note"] = "note"
+    text: Annotated[str, Field(max_length=LONGEST_NOTE)]
+
+
 class End(TimedEntry):
     """The end of the run."""
 
@@ -133,6 +151,8 @@ Entry: TypeAlias = (
     | NewTruth
     | NewFaults
     | ClearedFaults
+    | AwaitedPhase
+    | Note
     | End
 )
 

@@ -24,13 +24,13 @@ COLUMNS: Final = (
     "cross_boresight_arcsec", "roll_arcsec", "total_arcsec", "sigma_cross_arcsec", "sigma_roll_arcsec",
     "stars_detected", "stars_matched", "rms_px", "latency_ms", "processing_ms", "render_ms", "detect_ms", "identify_ms", "late",
     "search", "triggered", "error_psi", "cell", "weights", "region_deg", "stars_used", "stars_removed", "motion_rotation_deg",
-    "motion_translation_deg", "refined", "false_detected", "false_removed",
+    "motion_translation_deg", "refined", "false_detected", "false_removed", "clock_error_s",
 )  # fmt: skip
 """Columns: device time as Unix time, quaternions ICRS→sensor scalar last, errors of the measured attitude.
 
 `latency_ms` is simulation time from mid-exposure to publication. `processing_ms` and the next three columns
 are wall times; they are empty on the stepped clock, so that the same run gives the same file. The columns from
-`search` on are those of `starid.identification.solution.FeatureReport`, and the false stars among the detections and among
+`search` to `false_removed` are those of `starid.identification.solution.FeatureReport`, and the false stars among the detections and among
 those that the filter removed; they are empty for `geometric`.
 """
 
@@ -44,7 +44,9 @@ _DIGITS: Final = 6
 def _is_exact(name: str) -> bool:
     """Return whether the floats of a column are written with all digits: quaternions and simulation times."""
     return (
-        name.startswith(("true_q", "measured_q")) or name.endswith("time_s") or name == "time_of_exposure_s"
+        name.startswith(("true_q", "measured_q"))
+        or name.endswith(("time_s", "clock_error_s"))
+        or name == "time_of_exposure_s"
     )
 
 
@@ -80,6 +82,7 @@ def compare(measurement: Measurement) -> dict[str, Any]:
         "frame": measurement.counter,
         "time_of_exposure_s": measurement.mid_unix_ns / NANOSECONDS,
         "run_time_s": measurement.mid_ns / NANOSECONDS,
+        "clock_error_s": measurement.clock_error_ns / NANOSECONDS,
         "mode": measurement.mode.value,
         "valid": measurement.valid,
         "reason": measurement.reason,

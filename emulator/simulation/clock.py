@@ -9,13 +9,17 @@ only `RealClock` and `ScaledClock` read the wall clock.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 from starhil.emulator.errors import EmulatorError
+from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.storage.files import read_number
 
 MAX_SCALE: Final = 1000.0
+INVERSION_STEPS: Final = 4
+"""Each step makes the error of an inverted clock smaller by its drift, at most 0.1."""
 
 
 class ScaledClock:
@@ -49,6 +53,13 @@ class ScaledClock:
     def switch_on(self, wall_ns: int, limit_ns: int) -> None:
         """Let time pass since a time of the monotonic wall clock, up to `limit_ns`; before this, it is zero."""
         self._origin_ns, self._limit_ns = wall_ns, limit_ns
+
+    def hold(self) -> bool:
+        """Let time stand until `start`, if it passes; return whether it did."""
+        passed = self._limit_ns is None
+        if passed:
+            self._limit_ns = self.now_ns()
+        return passed
 
     def start(self) -> None:
         """Let time pass without a limit."""
@@ -93,6 +104,10 @@ class SteppedClock:
 
     def switch_on(self, wall_ns: int, limit_ns: int) -> None:
         """Do nothing: time passes on request."""
+
+    def hold(self) -> bool:
+        """Return that time does not pass, because it does so on request."""
+        return False
 
     def start(self) -> None:
         """Do nothing: time passes on request."""
@@ -151,21 +166,54 @@ def make_clock(text: str) -> ScaledClock | SteppedClock:
     raise EmulatorError(f"clock: must be real, scaled:FACTOR or stepped, not {text!r}")
 
 
+def _no_drift(_from_ns: int, _to_ns: int) -> int:
+    return 0
+
+
 @dataclass
 class DeviceTime:
-    """Unix time of the device: simulation time plus an offset, which telecommand 2 sets."""
+    """Unix time of the device: simulation time plus an offset, which telecommand 2 sets, and what its clock has gained."""
 
     clock: Clock
     offset_ns: int = 0
-    """Unix time at simulation time zero, nanoseconds."""
+    """Unix time minus simulation time when `since_ns`, nanoseconds."""
     was_set: bool = False
     """Whether the time was set since the last start."""
+    gained_ns: Callable[[int, int], int] = _no_drift
+    """Returns what the clock gains between two simulation times, nanoseconds."""
+    since_ns: int = 0
+    """Simulation time from which the clock drifts as now, nanoseconds."""
+    stuck_s: int | None = None
+    """Unix second at which the seconds of the clock stand; None if they go on."""
+
+    def start(self, unix_ns: int) -> None:
+        """Begin at a Unix time now, nanoseconds, which nobody has set."""
+        self.set_unix_ns(unix_ns)
+        self.was_set = False
 
     def unix_ns(self, run_ns: int | None = None) -> int:
-        """Return the Unix time at a simulation time, or now, nanoseconds."""
-        return (self.clock.now_ns() if run_ns is None else run_ns) + self.offset_ns
+        """Return the Unix time that the clock shows at a simulation time, or now, nanoseconds."""
+        at_ns = self.clock.now_ns() if run_ns is None else run_ns
+        unix_ns = at_ns + self.offset_ns + self.gained_ns(self.since_ns, at_ns)
+        if self.stuck_s is None:
+            return unix_ns
+        return self.stuck_s * NANOSECONDS + unix_ns % NANOSECONDS
+
+    def run_ns(self, unix_ns: int) -> int:
+        """Return the simulation time at which the clock, unless its second is stuck, shows a Unix time, nanoseconds."""
+        run_ns = unix_ns - self.offset_ns
+        for _ in range(INVERSION_STEPS):
+            run_ns = unix_ns - self.offset_ns - self.gained_ns(self.since_ns, run_ns)
+        return run_ns
+
+    def rebase(self) -> None:
+        """Keep what the clock has gained until now, because its drift is going to change."""
+        now_ns = self.clock.now_ns()
+        self.offset_ns += self.gained_ns(self.since_ns, now_ns)
+        self.since_ns = now_ns
 
     def set_unix_ns(self, unix_ns: int) -> None:
         """Set the current Unix time, nanoseconds."""
-        self.offset_ns = unix_ns - self.clock.now_ns()
+        self.since_ns = self.clock.now_ns()
+        self.offset_ns = unix_ns - self.since_ns
         self.was_set = True

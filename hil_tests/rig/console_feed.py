@@ -93,9 +93,17 @@ class RunFeed:
                 return
 
     def _post(self, event: dict[str, Any]) -> None:
+        """Send an event; once more on a new connection if the console has closed this one, which was idle."""
         body = json.dumps({"run": self._run, **event})
-        self._connection.request("POST", self._path, body, {"Content-Type": "application/json"})
-        response = self._connection.getresponse()
+        for last in (False, True):
+            try:
+                self._connection.request("POST", self._path, body, {"Content-Type": "application/json"})
+                response = self._connection.getresponse()
+                break
+            except (ConnectionError, http.client.RemoteDisconnected, http.client.CannotSendRequest):
+                self._connection.close()
+                if last:
+                    raise
         text = response.read().decode(errors="replace").strip()
         if response.status != http.client.OK:
             raise BenchError(text or f"status {response.status}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import socket
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any, Final, Self
 from urllib.parse import urlsplit
@@ -26,6 +27,9 @@ ANSWER_WITHIN_S: Final = 60.0
 """A step of the stepped clock takes as long as its frames."""
 BOOT_WITHIN_S: Final = 60.0
 POLL_S: Final = 0.02
+CLOCK_GRAIN_S: Final = 1e-9
+LONGEST_WAIT_S: Final = 20.0
+"""Longest wait of one request, shorter than an answer may take."""
 
 
 class ControlClient:
@@ -65,6 +69,44 @@ class ControlClient:
         if not answer.pop("ok"):
             raise BenchError(f"{what}: {answer['error']}")
         return answer
+
+    def wait(self, seconds: float = 0.0, *, phase: str | None = None) -> float:
+        """Let simulation time pass on any clock; return the simulation time, seconds.
+
+        With `phase`, wait for the next `exposure` to begin, its middle (`mid_frame`) or its end (`readout`).
+        """
+        if phase is not None:
+            return float(self.do("wait", phase=phase)["run_time_s"])
+        status = self.do("status")
+        now_s = float(status["run_time_s"])
+        stepped, end_s = status["clock"] == "stepped", now_s + seconds
+        while (left_s := end_s - now_s) >= CLOCK_GRAIN_S:
+            answer = self.do("step" if stepped else "wait", seconds=min(left_s, LONGEST_WAIT_S))
+            now_s = float(answer["run_time_s"])
+        return now_s
+
+    def step_until(
+        self,
+        holds: Callable[[dict[str, Any]], bool],
+        *,
+        step_s: float = 0.1,
+        within_s: float = 60.0,
+    ) -> dict[str, Any]:
+        """Let simulation time pass in steps until a condition of the answer to `status` holds; return this answer.
+
+        Raises BenchError: it does not hold within this simulation time.
+        """
+        status = self.do("status")
+        end_s = float(status["run_time_s"]) + within_s
+        while not holds(status):
+            if float(status["run_time_s"]) >= end_s:
+                raise BenchError(
+                    f"control channel: the condition does not hold within {within_s:g} s; mode {status['mode']}, "
+                    f"{status['frames_valid']} of {status['frames']} frames valid"
+                )
+            self.wait(step_s)
+            status = self.do("status")
+        return status
 
     def reset(self) -> None:
         """Clear faults, restore the truth of the profile, and let the device start and boot as at power-on.

@@ -96,6 +96,7 @@ def _starhil_command() -> list[str]:
     """Return the beginning of a command line for a `starhil` that ends with this process."""
     return [
         sys.executable,
+        "-P",
         "-m",
         "starhil.hil_tests.rig.end_with_parent",
         str(os.getpid()),

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
+from starhil.hil_tests.attitude import Quaternion, unit
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.client.async_client import DEFAULT_TIMEOUT_S
 from starhil.hil_tests.client.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
@@ -68,7 +69,8 @@ class Rig:
 
     On exit it raises `EmulatorProcessError` if the emulator ended unexpectedly or does not end cleanly.
 
-    The bench starts and ends `emulator`, a process that has not been started; `log_folder` gets `serial.log` and `can.log`.
+    The bench starts and ends `emulator`, a process that has not been started; `control` is the control channel of one that
+    runs already; `log_folder` gets `serial.log` and `can.log`.
     """
 
     def __init__(
@@ -77,12 +79,14 @@ class Rig:
         icd: InterfaceDefinition,
         *,
         emulator: EmulatorProcess | None = None,
+        control: str | None = None,
         log_folder: Path | None = None,
     ) -> None:
         self.options = options
         self.links = options.links
         self.icd = icd
         self.emulator = emulator
+        self._control_address = control
         self.log_folder = log_folder
         self.logs: dict[str, WireLog] = {}
         self._clients: dict[str, ObcClient] = {}
@@ -130,10 +134,16 @@ class Rig:
     def control(self, action: str, keys: Mapping[str, Any]) -> dict[str, Any]:
         """Send a request on the control channel of the emulator, and return its answer.
 
-        Raises BenchError: the request was rejected, or the unit is not an emulator that the bench started.
+        Raises BenchError: the request was rejected, or there is no control channel.
         """
-        with ControlClient(self._own_emulator.ready["control"]) as channel:
+        address = self._control_address or self._own_emulator.ready["control"]
+        with ControlClient(address) as channel:
             return channel.do(action, **keys)
+
+    @property
+    def has_control_of_another(self) -> bool:
+        """Whether the bench has the control channel of an emulator that it did not start."""
+        return self._control_address is not None
 
     def restart(self, how: str) -> None:
         """End the emulator by SIGTERM (`term`) or SIGKILL (`kill`) and start it again.
@@ -156,3 +166,14 @@ class Rig:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.__exit__(kind, error, trace)
+
+
+class ControlledTruth:
+    """The true attitude over time, by the control channel of the emulator."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+
+    def at(self, time_s: float) -> Quaternion:
+        """Return the attitude at a Unix time of the device's clock."""
+        return unit(self._rig.control("truth", {"unix_s": time_s})["quaternion_xyzw"])

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from starhil.hil_tests.attitude import Quaternion
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.reports import FAILED, PASSED, SKIPPED
 from starhil.hil_tests.rig.interruption import Interrupted
-from starhil.hil_tests.rig.rig import Rig
+from starhil.hil_tests.rig.rig import ControlledTruth, Rig
 from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.results import SessionResult, StepResult
 from starhil.hil_tests.session.script import Script
-from starhil.hil_tests.session.step import Attempt, SessionState, Step
+from starhil.hil_tests.session.step import Attempt, SessionState, Step, TruthOverTime
 from starhil.protocol.errors import ProtocolError
 
 
@@ -30,9 +31,13 @@ def run_steps(
     `folder` gets CSV and image files; `truth_path` is a file of true attitudes instead of the script's truth. A signal,
     whether during a step or while a result is shown, ends the run; the results of earlier steps are kept.
     """
-    if truth_path is None and script.truth.file is not None:
-        truth_path = folder / script.truth.file
-    truth = script.truth.attitude if truth_path is None else TruthLogReader(truth_path)
+    truth: Quaternion | TruthOverTime | None = script.truth.attitude
+    if truth_path is not None:
+        truth = TruthLogReader(truth_path)
+    elif rig.has_control_of_another:
+        truth = ControlledTruth(rig)
+    elif script.truth.file is not None:
+        truth = TruthLogReader(folder / script.truth.file)
     session = SessionState(rig, folder, truth)
     begin = time.monotonic()
     planned = script.planned(rig.links)
@@ -83,15 +88,31 @@ def _run_step(session: SessionState, number: int, step: Step, link: str) -> Step
 
 def _try_until_passed(session: SessionState, step: Step, link: str) -> Attempt:
     """Try an action once, or repeatedly until its expectations hold or its time is over."""
-    deadline = None if step.within_s is None else time.monotonic() + step.within_s
+    begin = time.monotonic()
+    problems: list[str] = []
     while True:
         attempt = _try_once(session, step, link)
-        if attempt.problem is None or deadline is None:
+        if step.within_s is None:
             return attempt
+        if attempt.problem is None:
+            if problems:
+                held = f"after {time.monotonic() - begin:.2f} s"
+                attempt.detail = f"{held}: {attempt.detail}" if attempt.detail else held
+            return attempt
+        problems.append(attempt.problem)
+        deadline = begin + step.within_s
         if time.monotonic() >= deadline:
-            attempt.problem = f"not within {step.within_s:g} s: {attempt.problem}"
+            attempt.problem = f"not within {step.within_s:g} s: {_of_attempts(problems)}"
             return attempt
         time.sleep(min(step.pause_s, max(0.0, deadline - time.monotonic())))
+
+
+def _of_attempts(problems: Sequence[str]) -> str:
+    """Return what was wrong in the first and the last attempt, and how many there were."""
+    first, last = problems[0], problems[-1]
+    if first == last:
+        return last if len(problems) == 1 else f"{last} ({len(problems)} attempts; the first was the same)"
+    return f"{last} (attempt {len(problems)}; the first: {first})"
 
 
 def _try_once(session: SessionState, step: Step, link: str) -> Attempt:

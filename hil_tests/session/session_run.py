@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -12,6 +13,7 @@ from typing import Final
 from rich.console import Console
 from rich.text import Text
 
+from starhil.hil_tests.attitude import attitude_error, unit
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError
 from starhil.hil_tests.reports import FAILED, PASSED, SKIPPED, prepare_report, write_junit
 from starhil.hil_tests.rig.console_feed import RunFeed, console_address
@@ -20,6 +22,7 @@ from starhil.hil_tests.rig.interruption import Interrupted
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from starhil.hil_tests.rig.rig import LinkOptions, Rig, links_to_use
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
+from starhil.hil_tests.session.expect import show_angle
 from starhil.hil_tests.session.results import SessionResult, StepResult, junit_cases
 from starhil.hil_tests.session.script import Script, load_script
 from starhil.hil_tests.session.session import run_steps
@@ -29,6 +32,8 @@ from starhil.protocol.files.bundled import DEFAULT_UNIT, find, not_found
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.unit import load_unit
 
+TRUTH_WITHIN_ARCSEC: Final = 1.0
+"""Largest difference of two truths that are the same."""
 DEFAULT_FOLDER: Final = Path("out") / "session"
 STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED: ("-", "yellow")}
 
@@ -45,6 +50,8 @@ class SessionRequest:
     folder: Path | None = None
     junit: Path | None = None
     truth: Path | None = None
+    control: str | None = None
+    """Address of the control channel of an emulator that runs already."""
     keep_going: bool = False
     quiet: bool = False
     view: str | None = None
@@ -73,7 +80,7 @@ def run_session(request: SessionRequest) -> SessionResult:
     if request.keep_going:
         script.defaults.keep_going = True
     options = _options(request, script)
-    _check_steps(path, script, icd, options.links, start=request.start)
+    _check_steps(path, script, icd, options.links, request)
     folder = request.folder or DEFAULT_FOLDER / path.stem
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -83,11 +90,16 @@ def run_session(request: SessionRequest) -> SessionResult:
         prepare_report(request.junit)
     console = Console(highlight=False, quiet=request.quiet)
     console.print(Text(escape_controls(script.title), style="bold"))
+    if not request.start and request.control is None and _asks_for_an_emulator(script):
+        hint = f"for an emulator that was started by: {start_command(script, folder)}"
+        console.print(Text(escape_controls(hint), style="dim"), soft_wrap=True)
     show: Callable[[StepResult], None] = partial(_print_result, console)
     result: SessionResult | None = None
     try:
         with ExitStack() as stack:
             rig = _open_bench(request, script, options, icd, folder, stack)
+            if request.control is not None:
+                _check_emulator(path, script, rig, folder)
             show = _shown_on_console(request.view, script, rig, stack, show)
             result = run_steps(script, rig, folder, on_result=show, truth_path=request.truth)
         if all(step.status == SKIPPED for step in result.results) and result.interruption is None:
@@ -111,14 +123,63 @@ def run_session(request: SessionRequest) -> SessionResult:
     return result
 
 
+def _asks_for_an_emulator(script: Script) -> bool:
+    """Return whether a script names a profile or settings of the emulator, or where the sensor looks."""
+    wanted = script.emulator
+    return bool(wanted.profile or wanted.settings or script.truth.attitude)
+
+
+def start_command(script: Script, folder: Path) -> str:
+    """Return the command that starts an emulator for a script."""
+    wanted = script.emulator
+    settings = pointed(script.truth.attitude, wanted.settings)
+    words = ["starhil", "run", *([wanted.profile] if wanted.profile else [])]
+    words += [word for setting in settings for word in ("--set", setting)]
+    words += [] if wanted.seed is None else ["--seed", str(wanted.seed)]
+    words += [] if script.truth.file is None else ["--truth-log", str(folder / script.truth.file)]
+    return shlex.join([*words, "--control", "auto"])
+
+
+def _check_emulator(path: Path, script: Script, rig: Rig, folder: Path) -> None:
+    """Raise BenchError if the emulator that runs is not the one that a script is for: its profile, its clock, where it looks."""
+    status, wanted = rig.control("status", {}), script.emulator
+    problems = []
+    if status["clock"] == "stepped":
+        problems.append("its clock is stepped, on which a session waits for ever")
+    if wanted.profile and status["profile"] != Path(wanted.profile).stem:
+        problems.append(f"its profile is {status['profile']}, not {Path(wanted.profile).stem}")
+    if status["mode"] in ("boot", "error"):
+        problems.append(f"its mode is {status['mode']}")
+    if script.truth.attitude is not None:
+        present = unit(rig.control("truth", {})["quaternion_xyzw"])
+        off = attitude_error(present, script.truth.attitude).total_arcsec
+        if off > TRUTH_WITHIN_ARCSEC:
+            problems.append(f"it looks {show_angle(off)} from where the script has the truth")
+    if problems:
+        command = start_command(script, folder)
+        raise BenchError(
+            f"{path.name}: the emulator does not fit: {'; '.join(problems)}; start it by: {command}"
+        )
+
+
 def _check_steps(
-    path: Path, script: Script, icd: InterfaceDefinition, links: tuple[str, ...], *, start: bool
+    path: Path, script: Script, icd: InterfaceDefinition, links: tuple[str, ...], request: SessionRequest
 ) -> None:
-    """Raise ScriptError if a step can never pass on these links, or needs an emulator that the bench starts."""
+    """Raise ScriptError if a step can never pass on these links, needs an emulator that the bench starts, or a truth that is missing."""
+    controlled = request.start or request.control is not None
+    if script.truth.file is not None and request.truth is None and not controlled:
+        folder = request.folder or DEFAULT_FOLDER / path.stem
+        log = shlex.quote(str(folder / script.truth.file))
+        raise ScriptError(
+            f"{path.name}: compares attitudes with a truth that the emulator writes: use --start; or start it by: "
+            f"{start_command(script, folder)} and give --truth {log}, or its control channel with --control"
+        )
     for number, step, link in script.planned(links):
         why = ""
-        if step.needs_emulator and not start:
+        if step.needs_emulator and not request.start:
             why = "only an emulator that the bench started can do this: use --start"
+        elif step.needs_control and not controlled:
+            why = "only an emulator can do this: use --start, or --control with the address on its ready line"
         elif isinstance(step, Listen) and link == "can" and icd.link.can is None:
             why = f"unit {icd.name} has only CANopen on CAN, where no row is sent without a request; read it"
         if why:
@@ -149,7 +210,9 @@ def _open_bench(
             options = replace(options, can=stack.enter_context(private_can_bus()))
         state = stack.enter_context(temporary_folder("starhil-session-"))
         emulator = _emulator(request, script, options, folder, state)
-    rig = stack.enter_context(Rig(options, icd, emulator=emulator, log_folder=folder))
+    rig = stack.enter_context(
+        Rig(options, icd, emulator=emulator, control=request.control, log_folder=folder)
+    )
     if emulator is not None:
         emulator.check_unit(request.unit)
     for link in rig.links:

@@ -10,7 +10,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Protocol, Self, TypeVar
 
 from pydantic import Field, ValidationInfo, model_validator
 
@@ -18,7 +18,6 @@ from starhil.hil_tests.attitude import Quaternion
 from starhil.hil_tests.client.transactions import Ack, Reading
 from starhil.hil_tests.errors import BenchError, NackError
 from starhil.hil_tests.rig.rig import Rig
-from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.expect import (
     AttitudeCheck,
     Keys,
@@ -39,6 +38,13 @@ MS_PER_S: Final = 1e3
 Answer = TypeVar("Answer", Ack, Reading)
 
 
+class TruthOverTime(Protocol):
+    """True attitudes over the time of the device."""
+
+    def at(self, time_s: float) -> Quaternion:
+        """Return the attitude at a Unix time of the device's clock."""
+
+
 @dataclass
 class SessionState:
     """What the steps of a session share."""
@@ -46,7 +52,7 @@ class SessionState:
     rig: Rig
     folder: Path
     """Gets CSV and image files."""
-    truth: Quaternion | TruthLogReader | None
+    truth: Quaternion | TruthOverTime | None
     captured: dict[str, Value] = field(default_factory=dict)
     step_begin_s: float = 0.0
     """Begin of the present step, on `time.monotonic`."""
@@ -55,7 +61,7 @@ class SessionState:
         """Return the true attitude at the time of a reading."""
         if self.truth is None:
             raise BenchError("no truth to compare the attitude with")
-        if not isinstance(self.truth, TruthLogReader):
+        if isinstance(self.truth, Quaternion):
             return self.truth
         if "time_of_exposure" not in reading.values:
             raise BenchError(f"{reading.name} has no time; read precise_attitude")
@@ -90,6 +96,8 @@ class Step(Keys):
     needs_link: ClassVar[bool] = True
     needs_emulator: ClassVar[bool] = False
     """Whether the step is for an emulator that the bench has started."""
+    needs_control: ClassVar[bool] = False
+    """Whether the step is for an emulator whose control channel the bench has."""
 
     name: str = ""
     expect: dict[str, ReadConditions] = Field(default_factory=dict)
@@ -198,4 +206,6 @@ class RequestStep(Step):
             return Attempt(detail=f"refused with {error.code} ({self.refused}), as expected"), None
         if self.refused is not None:
             return Attempt(problem=f"accepted, expected to be refused with {self.refused}"), answer
+        if isinstance(answer, Ack) and not answer.answered:
+            return Attempt(detail="sent; no reply is expected"), answer
         return Attempt(detail="accepted", latency_s=answer.latency_s), answer

@@ -8,7 +8,6 @@ and names in enumerations are those of the interface definition. Beside what `st
 from __future__ import annotations
 
 import csv
-import json
 import time
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Final, Literal, Self
@@ -338,17 +337,17 @@ class Restart(Step):
 
 
 class Control(Step):
-    """Send a request on the control channel of the emulator that the session started."""
+    """Send a request on the control channel of the emulator."""
 
     default_name = "control channel: {self.action}"
     needs_link = False
-    needs_emulator = True
-    action: Literal["fault", "clear_faults", "set_truth", "scenario", "step"] = Field(alias="control")
+    needs_control = True
+    action: Literal["fault", "clear_faults", "set_truth", "scenario", "step", "wait"] = Field(alias="control")
     keys: Annotated[dict[str, Any], AfterValidator(check_json)] = Field({}, alias="with")
 
     def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- no link
         """Send the request."""
-        return Attempt(detail=json.dumps(session.rig.control(self.action, self.keys)))
+        return Attempt(detail=in_words(session.rig.control(self.action, self.keys)))
 
 
 ACTIONS: Final[Mapping[str, type[Step]]] = {
@@ -365,6 +364,23 @@ ACTIONS: Final[Mapping[str, type[Step]]] = {
     "control": Control,
 }
 """Key of an action → its class."""
+
+
+def in_words(answer: Mapping[str, Any]) -> str:
+    """Return an answer of the control channel in one line, for people."""
+    return ", ".join(_shown(key, value) for key, value in answer.items())
+
+
+def _shown(key: str, value: Any) -> str:
+    if isinstance(value, Mapping):
+        return f"{key} {in_words(value) or 'none'}"
+    if isinstance(value, list) and any(isinstance(item, Mapping) for item in value):
+        return "; ".join(_shown(key, item) for item in value)
+    if value is True:
+        return key
+    if isinstance(value, list):
+        return f"{key} {' '.join(map(show, value))}"
+    return f"{key} {show(value)}" if isinstance(value, int | float | str) else f"{key} none"
 
 
 def _in_csv(value: Value) -> Value:

@@ -1,7 +1,7 @@
 """A headless viewer of the console, for measurements: `python -m starhil.hil_tests.timing.console_viewer ADDRESS`.
 
 Like an open page, it subscribes to images and to the rows that the page shows first, reads everything, and acknowledges each
-image.
+turn.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ async def view(address: str) -> None:
     ):
         await socket.send_str(json.dumps({"id": 1, "do": "subscribe", "frames": True, "rows": ROWS}))
         async for message in socket:
-            if message.type is aiohttp.WSMsgType.BINARY and message.data[:1] == b"F":
+            if message.type is aiohttp.WSMsgType.BINARY:
                 await socket.send_str(json.dumps({"do": "received"}))
 
 

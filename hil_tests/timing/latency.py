@@ -137,7 +137,7 @@ class Echo:
     async def start(self) -> None:
         """Start the process."""
         await self._line.start(lambda _data: self._arrived.put_nowait(time.perf_counter()))
-        self._process = subprocess.Popen([sys.executable, "-c", ECHO, self._line.description])  # noqa: S603
+        self._process = subprocess.Popen([sys.executable, "-P", "-c", ECHO, self._line.description])  # noqa: S603
         await self._arrived.get()
 
     async def ask(self, row: Row) -> float:
@@ -163,7 +163,7 @@ class Viewers:
     """Viewers of the console of an emulator, one process each."""
 
     def __init__(self, address: str, count: int) -> None:
-        command = [sys.executable, "-m", "starhil.hil_tests.timing.console_viewer", address]
+        command = [sys.executable, "-P", "-m", "starhil.hil_tests.timing.console_viewer", address]
         self._processes = [subprocess.Popen(command) for _ in range(count)]  # noqa: S603
 
     def close(self) -> None:

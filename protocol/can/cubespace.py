@@ -26,6 +26,7 @@ from starhil.protocol.messages import (
     DEFAULT_MAX_SIZE,
     DEFAULT_TIMEOUT_S,
     FaultKind,
+    Flaw,
     LinkFault,
     Receiver,
     Reply,
@@ -171,6 +172,8 @@ def encode_reply_frames(reply: Reply, source: int) -> list[CanFrame]:
             )
         first, middle, last = segments
         kinds = [first, *[middle] * (len(payloads) - 2), last]
+        if Flaw.SEQUENCE in reply.flaw:
+            payloads[-1] = payloads[-1][:-1] + bytes((payloads[-1][-1] + 1,))
     return [
         CanFrame(CanId(kind, reply.id, source, reply.destination).pack(), payload)
         for kind, payload in zip(kinds, payloads, strict=True)

@@ -100,7 +100,8 @@ class TransmitPdo(Pdo):
         self._inhibit, self._sync_start = (context.dictionary.find(communication, item) for item in (3, 6))
         self._inhibit.writer = self._check_disabled
         self._sync_start.writer = self._check_sync_start
-        self._keys: frozenset[tuple[int, int]] = frozenset()
+        self.keys: frozenset[tuple[int, int]] = frozenset()
+        """Keys of the mapped entries."""
         self._event = False
         self._syncs = 0
         self._started = False
@@ -110,7 +111,7 @@ class TransmitPdo(Pdo):
     def configure(self) -> None:
         """Apply the current records and restart the timers and the SYNC count."""
         super().configure()
-        self._keys = frozenset(mapped.entry.key for mapped in self._objects if mapped.entry is not None)
+        self.keys = frozenset(mapped.entry.key for mapped in self._objects if mapped.entry is not None)
         self.stop()
 
     def stop(self) -> None:
@@ -144,7 +145,7 @@ class TransmitPdo(Pdo):
 
     def trigger(self, keys: Iterable[tuple[int, int]]) -> None:
         """Mark an event of these objects; `tick` sends an event-driven PDO once the inhibit time allows."""
-        if self.active and not self._keys.isdisjoint(keys):
+        if self.active and not self.keys.isdisjoint(keys):
             self._event = True
 
     def synchronise(self, counter: int) -> None:
@@ -239,6 +240,12 @@ class PdoService:
         """Trigger the TPDOs that map one of these objects."""
         for pdo in self.transmitting:
             pdo.trigger(keys)
+
+    def mapped_by(self, can_id: int) -> frozenset[tuple[int, int]]:
+        """Return the keys of the entries in the TPDO with a CAN ID; none if no TPDO has it."""
+        return frozenset().union(
+            *(pdo.keys for pdo in self.transmitting if pdo.active and pdo.can_id == can_id)
+        )
 
     def synchronise(self, counter: int) -> None:
         """Act on a SYNC: first send samples of this instant, then apply received messages."""

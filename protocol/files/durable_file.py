@@ -17,7 +17,8 @@ def replace_durably(path: Path, data: bytes) -> None:
     """
     temporary = path.with_name(f"{path.name}.new")
     try:
-        with temporary.open("wb") as file:
+        temporary.unlink(missing_ok=True)  # of an interrupted call, or a link that others have put there
+        with temporary.open("xb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

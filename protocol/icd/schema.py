@@ -159,6 +159,8 @@ class RowKeys(DefinitionModel):
     """Public source of the row."""
     action: str | None = None
     """Action that a telecommand performs, or that follows each reading of a telemetry row."""
+    confirm: bool = False
+    """Whether the console asks before it sends the telecommand, because it interrupts the unit or deletes something."""
     arguments: dict[Name, Scalar] = {}
     """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
     unsolicited: (

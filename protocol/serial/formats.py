@@ -43,11 +43,12 @@ class MessageFormat:
         """The class of all messages, if there is only one."""
         return self.classes[0] if len(self.classes) == 1 else ""
 
-    def close(self, header: bytes, data: bytes) -> bytes:
-        """Return header, data and check of a message."""
+    def close(self, header: bytes, data: bytes, *, wrong_check: bool = False) -> bytes:
+        """Return header, data and check of a message; each bit of a wrong check is inverted."""
         if not self.check.size:
             return header + data
-        return header + data + self.check.compute(self._covered(header, data))
+        check = self.check.compute(self._covered(header, data))
+        return header + data + (bytes(byte ^ 0xFF for byte in check) if wrong_check else check)
 
     def _covered(self, header: bytes, data: bytes) -> bytes:
         covers = self.check.covers

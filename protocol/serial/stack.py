@@ -30,6 +30,7 @@ from starhil.protocol.messages import (
     DEFAULT_MAX_SIZE,
     ErrorCode,
     FaultKind,
+    Flaw,
     LinkFault,
     Reply,
     ReplyKind,
@@ -217,6 +218,14 @@ class SerialStack:
         codes = item is not None and item.code is not None and item.unsolicited_code != item.reply_code
         return bool(self.dialects) or codes
 
+    @property
+    def shown_in_replies(self) -> frozenset[str]:
+        """What a reply carries besides its data, in some class or dialect: `id`, `sequence`, `check`."""
+        headers = [self.replies.header, *(h for d in self._in_dialect.values() for h in d.headers.values())]
+        roles = {role for header in headers for role in header.roles}
+        checked = {"check"} if any(form.check.size for form in self.reply_formats.all) else set()
+        return frozenset(roles & {"id", "sequence"} | checked)
+
     def counts(self, kind: ReplyKind) -> bool:
         """Return whether the device numbers messages of this kind itself."""
         unsolicited = kind in (ReplyKind.UNSOLICITED, ReplyKind.EVENT)
@@ -278,16 +287,17 @@ class SerialStack:
                 reply.flags,
             )  # fmt: skip
             return self.encode_request(echo)
+        wrong_check = Flaw.CHECK in reply.flaw
         text = self.texts.encode(reply)
         if text is not None:
-            return self.replies.framing.encode(self.replies.close(b"", text))
+            return self.replies.framing.encode(self.replies.close(b"", text, wrong_check=wrong_check))
         header = self.replies.header
         if refused and not header.roles_in(reply.message_class) & {"status", "ack"}:
             return b""
         values = {
             "id": reply.id or 0,
             "destination": reply.destination,
-            "sequence": reply.sequence,
+            "sequence": reply.sequence + (Flaw.SEQUENCE in reply.flaw),
             "status": int(reply.code),
             "ack": int(not refused),
             "final": int(reply.final),
@@ -304,7 +314,7 @@ class SerialStack:
             values["class"] = (item.unsolicited_code if unsolicited else item.reply_code) or 0
         form = self.reply_formats.of(reply.message_class)
         header_bytes = form.header.pack(values, reply.message_class, len(reply.data))
-        return form.framing.encode(form.close(header_bytes, reply.data))
+        return form.framing.encode(form.close(header_bytes, reply.data, wrong_check=wrong_check))
 
     def _request_of(self, form: MessageFormat, body: bytes) -> Request | LinkFault:
         if form in self.text_formats:

@@ -380,6 +380,7 @@ class _Reader:
                 source=model.source or (self._unit.source if provenance == "confirmed" else ""),
                 message_class=message_class,
                 action=model.action,
+                confirm=model.confirm,
                 unsolicited=model.unsolicited,
                 arguments={
                     name: number if value == NUMBER else value for name, value in model.arguments.items()

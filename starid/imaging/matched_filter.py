@@ -16,6 +16,7 @@ import numpy.typing as npt
 from starid.arrays import Array32, GreyImage, Indices32
 from starid.imaging.background import block_position
 from starid.kernels.jit import compiled_ieee
+from starid.kernels.small_arrays import zero
 
 INTEGER_TAPS_SUM: Final = 16
 """Sum of the integer filter's taps along one axis, so that a byte smoothed along both axes fits 16 bits."""
@@ -258,7 +259,7 @@ def find_peaks(
     limit = np.empty(width, np.float32)
     flags = np.empty(-(-width // _GROUP), np.uint8)
     above = np.zeros(_GROUP * flags.size, np.uint8)
-    count = 0
+    count = zero()
     line = -1
     for y in range(height + 1):
         if y < height:
@@ -325,7 +326,7 @@ def find_peaks_in_bytes(
     flags = np.empty(-(-width // _GROUP), np.uint8)
     scale = np.float32(INTEGER_TAPS_SUM**2)
     highest = np.int32(65535)
-    count = 0
+    count = zero()
     line = -1
     for y in range(height + 1):
         if y < height:

@@ -1,11 +1,19 @@
-"""Operations on small arrays for kernels, in place of numpy functions that take seconds to compile."""
+"""Operations for kernels, in place of forms that take seconds to compile: on small arrays, and a count from zero."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from starid.arrays import Array, Array32
 from starid.kernels.jit import inner
+
+
+@inner
+def zero() -> int:
+    """Return 0 as a variable: numba would compile a function to which a constant is passed for that constant too."""
+    return int(np.int64(0))
 
 
 @inner

@@ -114,9 +114,9 @@ async def every_row_read(emulation):
     """Wait until console or recording, whose requests are not counted, has read every telemetry row."""
     read, telemetry = set(), emulation.requests.telemetry
 
-    def note(name, snapshot):
+    def note(name, snapshot, hits=()):
         read.add(name)
-        return telemetry(name, snapshot)
+        return telemetry(name, snapshot, hits)
 
     emulation.requests.telemetry = note
     async with asyncio.timeout(20.0):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import time
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 from starhil.emulator.console.console import Console
+from starhil.emulator.console.events import EventLog
 from starhil.emulator.console.obc import Exchange
 from starhil.emulator.console.reported_runs import ReportedRuns
 from starhil.emulator.console.server import ConsoleServer
@@ -114,9 +116,6 @@ class _Obc:
 class _Socket:
     """A page that receives nothing."""
 
-    async def send_str(self, data: str, /) -> None:
-        """Take a message."""
-
     async def send_bytes(self, data: bytes, /) -> None:
         """Take a message."""
 
@@ -127,19 +126,27 @@ ASKED = [
     {"do": "point", "to": {"ra_deg": 10.0, "dec_deg": 20.0}, "rate_deg_s": 1.0}, {"do": "point", "to": {"star": "Sirius"}},
     {"do": "clock", "speed": 2.0}, {"do": "clear_session"}, {"do": "read", "row": "identification"},
     {"do": "encode", "row": "set_mode", "values": {"mode": "standby"}}, {"do": "send", "row": "set_mode", "values": {"mode": "standby"}},
+    {"do": "note", "text": "a", "at_s": 0.0}, {"do": "message", "n": 0},
     {"do": "encode", "row": "set_parameter", "values": {"id": 1, "value": 1.5}},
 ]  # fmt: skip
 
 
 def console_of(run_: _Loop) -> Console:
     """Return the console of a run."""
-    return Console(run_.run, run_.run.heads[0], _Obc(), StepRunner(run_.control.execute), ReportedRuns())
+    head = run_.run.heads[0]
+    return Console(run_.run, head, _Obc(), [EventLog(head)], StepRunner(run_.control.execute), ReportedRuns())
+
+
+def viewer_of(console: Console) -> Viewer:
+    """Return a page that receives nothing."""
+    return Viewer(_Socket(), console.history, console.trace, console.events, clock=time.monotonic)
 
 
 @target("console", lambda: request_edits(len(ASKED)))
 def _console(_folder: Path) -> Run:
     run_ = _Loop()
-    console, viewer = console_of(run_), Viewer(_Socket())
+    console = console_of(run_)
+    viewer = viewer_of(console)
 
     async def answer(request: Any) -> dict[str, Any]:
         reply = await console.answer(viewer, request)

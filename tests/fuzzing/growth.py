@@ -21,7 +21,6 @@ from typing import Any, cast
 
 from starhil.emulator.cli.fmu.process import PACKET, _unpacked
 from starhil.emulator.console.reported_runs import ReportedRuns
-from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.truth.feed import LiveFeed, _Datagrams
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.simulator_42 import Format42
@@ -34,7 +33,7 @@ from starhil.protocol.transports.connections import TURN
 from starhil.protocol.transports.hub import CanHub, _Client
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
-from tests.fuzzing.control import ASKED, REQUESTS, _Loop, _Socket, console_of
+from tests.fuzzing.control import ASKED, REQUESTS, _Loop, console_of, viewer_of
 from tests.fuzzing.edits import _spots
 from tests.fuzzing.target import Run, target
 from tests.fuzzing.wire import (
@@ -233,7 +232,8 @@ def channels() -> dict[str, Channel]:
     """Return every channel by name."""
     run_ = _Loop()
     run_.loop.set_default_executor(ThreadPoolExecutor(2, initializer=partial(sys.setprofile, _count)))
-    console, viewer, runs = console_of(run_), Viewer(_Socket()), ReportedRuns()
+    console, runs = console_of(run_), ReportedRuns()
+    viewer = viewer_of(console)
 
     def documents(requests: list[Any]) -> list[bytes]:
         return [json.dumps(request).encode() for request in requests]

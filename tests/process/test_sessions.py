@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+import re
+import shlex
 import subprocess
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
 
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from tests.candump import read_candump
 from tests.emulator.cli.command_line import log_lines, run_command_line
 from tests.protocol.export.dissection import dissect
@@ -120,6 +124,30 @@ def test_a_session_injects_faults_into_the_emulator_that_it_started(tmp_path):
     assert "blocked_shar: unknown key; did you mean blocked_share?" in result["results"][5]["detail"]
 
 
+def test_a_script_whose_truth_nobody_writes_is_rejected_with_the_command_that_does(tmp_path):
+    done = starhil("session", "slew_tracking", "--can", "socketcand:127.0.0.1:1/vcan0", "--log", tmp_path)
+    assert done.returncode == 2
+    assert (
+        "slew_tracking.toml: compares attitudes with a truth that the emulator writes: use --start"
+        in done.stderr
+    )
+    assert "starhil run ideal --set truth.kind=rate" in done.stderr
+    assert f"--truth-log {tmp_path / 'truth.csv'}" in done.stderr
+
+
+def test_the_commands_for_an_emulator_that_runs_work_as_the_page_has_them(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "sessions.md").read_text(encoding="utf-8")
+    (pair,) = re.findall(r"^    (starhil run .*--control.*)\n    (starhil session .*)$", page, re.MULTILINE)
+    run, session = (shlex.split(line.replace("/tmp/", f"{tmp_path}/"))[1:] for line in pair)
+    with EmulatorProcess([installed_command(), *run]):
+        done = starhil(*session, "--log", tmp_path / "log")
+        assert done.returncode == 0, done.stdout + done.stderr
+        moved = starhil("session", "slew_tracking", *session[2:], "--log", tmp_path / "other")
+        assert "its profile is cubestar, not ideal" in moved.stderr
+        assert "starhil run ideal --set truth.kind=rate" in moved.stderr
+
+
 def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
     (tmp_path / "mine.toml").write_text("[run]\nwrong = 1\n")
     script = tmp_path / "script.toml"
@@ -140,7 +168,7 @@ def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
         (
             "[[step]]\nwait_s = 0\n[[step]]\ncontrol = 'clear_faults'\n",
             ["--serial", "/dev/no-such-port"],
-            "wrong.toml: step 2: control: only an emulator that the bench started",
+            "wrong.toml: step 2: control: only an emulator can do this: use --start, or --control",
         ),
         (
             "[[step]]\nrestart = 'kill'\n",

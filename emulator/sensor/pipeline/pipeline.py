@@ -168,6 +168,8 @@ class Pipeline:
         try:
             if isinstance(request, IndexRequest):
                 self._identifiers.build(self._identifier_setup(request))
+                for rehearsal in request.rehearsals:
+                    self._rehearse(rehearsal)
                 return IndexReady()
             if isinstance(request, ImageRequest):
                 return self._scaled_image(request)
@@ -176,6 +178,30 @@ class Pipeline:
             return Failure(str(error))
         except Exception as error:  # noqa: BLE001 (one frame that fails must not end those after it)
             return Failure(f"pipeline: internal error: {one_line(error)}")
+
+    def _rehearse(self, request: FrameRequest) -> None:
+        """Take a frame that does not count: as it is, and with the bodies of its sky in the field.
+
+        Only `geometric` keeps nothing from frame to frame, so that only it identifies stars in them.
+        """
+        if self.images is not None:
+            return
+        last = self._last
+        if self._setup.algorithm == "geometric":
+            for predicted in (None, request.truth.attitude):
+                self._process_frame(replace(request, predicted=predicted))
+        else:
+            self.detections(request)
+        truth = request.truth
+        objects = self._sky.view(truth.unix_s, None, None, request.faults).objects
+        placed = {
+            name: getattr(_WARM_UP_BODIES, name)
+            for name in ("sun", "moon", "earth")
+            if getattr(objects, name)
+        }
+        if placed:
+            self._renderer.render(Attitude.identity(), objects=replace(objects, **placed))
+        self._last = last
 
     def _process_frame(self, request: FrameRequest) -> FrameResult:
         begin = time.perf_counter()

@@ -20,7 +20,7 @@ def start_helper() -> subprocess.Popen[bytes] | None:
     if not nothing_compiled():
         return None
     return subprocess.Popen(
-        [sys.executable, "-m", "starhil.emulator.sensor.pipeline.precompile"], stdin=subprocess.DEVNULL
+        [sys.executable, "-P", "-m", "starhil.emulator.sensor.pipeline.precompile"], stdin=subprocess.DEVNULL
     )
 
 

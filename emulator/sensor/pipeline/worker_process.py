@@ -38,7 +38,13 @@ class WorkerProcess:
         self.started_ns = time.monotonic_ns()
         """Time at which it was started, on the monotonic wall clock, nanoseconds."""
         self.socket, inherited = socket.socketpair()
-        command = [sys.executable, "-m", "starhil.emulator.sensor.pipeline.worker", str(inherited.fileno())]
+        command = [
+            sys.executable,
+            "-P",
+            "-m",
+            "starhil.emulator.sensor.pipeline.worker",
+            str(inherited.fileno()),
+        ]
         # in a process group of its own, so that Ctrl-C does not reach it while it imports
         self.process = subprocess.Popen(  # noqa: S603
             command, pass_fds=[inherited.fileno()], stdin=subprocess.DEVNULL, process_group=0

@@ -217,7 +217,7 @@ def make_answer(
     for axis in range(3):
         for k in range(3):
             unit[k] = variance if k == axis else 0.0
-        solve_symmetric(candidate.normal, unit, 3, column)
+        solve_symmetric(candidate.normal, unit, covariance.shape[0], column)
         for k in range(3):
             covariance[k, axis] = column[k]
     quaternion_of(candidate.frames[2], quaternion)

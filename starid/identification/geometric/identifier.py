@@ -194,7 +194,7 @@ class Identifier(SingleCameraIdentifier):
     def _search(self, camera: Camera, measured: CheckedDetections, numbers: Records) -> Answer:
         """Search the whole sky with a given camera and kernel settings."""
         detections = measured.xy, measured.flux, measured.sigmas
-        return self._identify_kernel(camera.params, *detections, numbers)
+        return self._identify_kernel(camera.params, *detections, numbers, MIN_MATCHED, WHOLE_SKY)
 
     def _numbers_for(self, measured: CheckedDetections) -> Records:
         """Kernel settings for one call."""

@@ -26,6 +26,7 @@ from starid.camera.projection import (
     undistort,
 )
 from starid.kernels.jit import inner
+from starid.kernels.small_arrays import zero
 
 Table = Array
 
@@ -124,7 +125,7 @@ def observe(raw: Raw) -> Table:
     order = by_decreasing_flux(raw.flux)
     params, xy, flux, sigmas = raw.params, raw.xy, raw.flux, raw.sigmas
     table = np.empty((flux.shape[0], COLUMNS))
-    n = 0
+    n = zero()
     for row in order:
         if not fill_direction(params, 1.0, xy[row, 0], xy[row, 1], table, n):
             continue

@@ -37,7 +37,7 @@ from starid.identification.geometric.observation import (
 from starid.identification.geometric.pattern_index import STAR_MAGNITUDE, IndexArrays
 from starid.identification.geometric.settings import Settings
 from starid.kernels.jit import inner
-from starid.kernels.small_arrays import lower_median
+from starid.kernels.small_arrays import lower_median, zero
 
 MAX_ROUNDS: Final = 12
 """Largest number of rounds of matching and solving."""
@@ -227,7 +227,7 @@ def normal_equations(
 @inner
 def photometry(star_table: Array, detections: Table, stars: Indices, scratch: Array) -> tuple[float, float]:
     """Robust zero point (catalogue minus instrumental magnitude) of the matches, and its scatter."""
-    m = 0
+    m = zero()
     for i in range(stars.shape[0]):
         if stars[i] >= 0:
             scratch[m] = star_table[stars[i], STAR_MAGNITUDE] - detections[i, MAGNITUDE]
@@ -244,7 +244,7 @@ def distances(
     star_table: Array, detections: Table, rotation: Array, stars: Indices, scratch: Array
 ) -> tuple[float, float]:
     """Noise for unit error, from the median distance of the matches (Rayleigh); their RMS distance, px."""
-    m = 0
+    m = zero()
     total = 0.0
     for i in range(stars.shape[0]):
         if stars[i] >= 0:
@@ -272,7 +272,7 @@ def _marginalise(normal: Array, scratch: Array) -> float:
 
     Returns the marginal variance of the logarithm of the scale.
     """
-    solve_symmetric(normal, normal[3], 3, scratch)
+    solve_symmetric(normal, normal[3], normal.shape[0] - 1, scratch)
     weight = normal[3, 3]
     for a in range(3):
         weight -= normal[3, a] * scratch[a]

@@ -15,7 +15,6 @@ import numpy as np
 from starid.arrays import Array, Indices, Records
 from starid.camera.projection import HEIGHT, MODEL, WIDTH
 from starid.identification.geometric.answer import (
-    MIN_MATCHED,
     Answer,
     Candidate,
     make_answer,
@@ -49,8 +48,9 @@ from starid.identification.geometric.pattern_index import (
 )
 from starid.identification.geometric.refinement import SCALE, ZERO_POINT
 from starid.identification.geometric.settings import ACCEPTED, NOTHING, TOO_FEW, Settings
-from starid.identification.geometric.verification import WHOLE_SKY, hit_odds, test_order
+from starid.identification.geometric.verification import hit_odds, test_order
 from starid.kernels.jit import compiled_ieee, inner
+from starid.kernels.small_arrays import zero
 
 SYSTEMATIC: Final = 14
 """Number of detections, brightest first, whose triangles are all tried first."""
@@ -148,6 +148,8 @@ def _try_patterns(
     patterns: Indices,
     count: int,
     gate: float,
+    min_matched: int,
+    prior: tuple[float, float],
 ) -> float:
     """Try the index triangles found for one triangle of detections.
 
@@ -181,7 +183,7 @@ def _try_patterns(
             framed = True
         set_rotation(stars, (a, b, c), frames)
         _, bound = test_and_refine(
-            index, raw, observed, settings, candidate, tests, corners, MIN_MATCHED, WHOLE_SKY
+            index, raw, observed, settings, candidate, tests, corners, min_matched, prior
         )
         if bound < settings.log_chance:
             return bound
@@ -241,22 +243,35 @@ def _next_triangle(i: int, j: int, k: int) -> tuple[int, int, int]:
 
 @compiled_ieee
 def identify_kernel(
-    index: IndexArrays, params: Array, xy: Array, flux: Array, sigmas: Array, records: Records
+    index: IndexArrays,
+    params: Array,
+    xy: Array,
+    flux: Array,
+    sigmas: Array,
+    records: Records,
+    min_matched: int,
+    prior: tuple[float, float],
 ) -> Answer:
     """Find the attitude of a set of detections without prior knowledge.
 
     Stage 0 tries the triangles of the brightest detections, stage 1 random triangles of more detections, and
     each further stage the triangles of the brightest detections in one part of the field. In that stage the
     sequential test uses only detections in the part, so that clutter elsewhere does not count; a candidate is
-    still refined and verified on the whole field. `records` is one record of SETTINGS.
+    still refined and verified on the whole field.
+
+    Parameters
+    ----------
+    records : ndarray (1,) of SETTINGS
+    min_matched : int
+        Least number of matches for an answer.
+    prior : (float, float)
+        See `starid.identification.geometric.verification.log_false_probability`.
     """
     raw = Raw(params, xy, flux, sigmas)
     settings: Settings = records[0]
     observed = observe(raw)
     n = observed.shape[0]
     candidate = new_candidate(n)
-    if n < MIN_MATCHED:
-        return make_answer(TOO_FEW, observed, candidate, settings, 0.0, 0, 0)
     odds, order = hit_odds(index, settings.test_window), test_order(n)
     patterns = np.empty(MAX_FOUND, dtype=np.int64)
     spread, limit, numbers = settings.scale_tolerance, settings.max_triangles, index.numbers
@@ -265,8 +280,8 @@ def identify_kernel(
     bounds = (numbers[SHORTEST_SIDE] / (1.0 + spread), widest, tolerance)
     members, draws, state = np.arange(min(n, SYSTEMATIC)), 0, np.uint64(_SEED)
     stage, i, j, k = 0, 0, 0, 1
-    triangles, candidates, bound = 0, 0, 0.0
-    while True:
+    triangles, candidates, bound = zero(), zero(), 0.0
+    while n >= min_matched:
         if stage == 1:
             draws += 1
             state, a, b, c = _draw_three(state, min(n, DRAWN_FROM))
@@ -303,9 +318,10 @@ def identify_kernel(
         candidates += count
         if count > 0:
             bound = _try_patterns(
-                index, raw, observed, settings, candidate, (odds, order), (a, b, c), s0, patterns, count, gate
-            )
+                index, raw, observed, settings, candidate, (odds, order), (a, b, c), s0, patterns, count, gate,
+                min_matched, prior,
+            )  # fmt: skip
             if bound < 0.0:
                 break
-    status = ACCEPTED if bound < 0.0 else NOTHING
+    status = ACCEPTED if bound < 0.0 else (TOO_FEW if n < min_matched else NOTHING)
     return make_answer(status, observed, candidate, settings, bound, triangles, candidates)

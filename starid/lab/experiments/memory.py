@@ -27,7 +27,7 @@ def compute(context: Context, part: Part) -> Results:
     """Sizes that a separate process prints; it is run twice, to leave out the compilation."""
     overlap = part["percent"] / 100.0
     context.database(overlap)
-    command = [sys.executable, "-m", __name__, str(context.database_file(overlap))]
+    command = [sys.executable, "-P", "-m", __name__, str(context.database_file(overlap))]
     for _ in range(2):
         done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
         if done.returncode != 0:

@@ -136,7 +136,9 @@ def test_warming_the_cache_starts_a_pipeline_that_needs_every_kernel_and_the_ind
 
 def test_a_failure_to_warm_the_cache_is_one_line(folder: Path, worker: Callable[..., object]) -> None:
     worker(RECORDS_SETUP.format(path=folder.parent / "setup", outcome="Failure('no catalogue')"))
-    assert run_command_line("cache", "warm") == (2, "", "starhil: no catalogue\n")
+    status, out, said = run_command_line("cache", "warm")
+    assert (status, out, said.count("\n")) == (2, "", 1)
+    assert said.endswith("cubestar.toml: no catalogue\n")
 
 
 def test_a_loop_of_links_does_not_stop_the_cache(folder):

@@ -2,12 +2,13 @@
 
 import asyncio
 import json
+import struct
 
 import aiohttp
 import numpy as np
 
 from starhil.emulator.cli.console_client import ConsoleClient
-from starhil.emulator.console.history import COLUMNS
+from starhil.emulator.console.history import COLUMNS, TIMES
 from starhil.emulator.launch import ConsoleOptions, RunOptions
 
 OPTIONS = RunOptions(control="auto", console=ConsoleOptions(ConsoleClient, view="auto"))
@@ -23,9 +24,10 @@ class Page:
         self.address = emulation.ready_fields[field] + (f"&head={head}" if head is not None else "")
         self.messages = []
         self.frames = []
-        self.history = None
+        self.rows = {}
         self.acknowledges = True
-        self._parts = []
+        self.rows_received = 0
+        self.turns = 0
         self._number = 0
 
     def url(self, path):
@@ -34,8 +36,7 @@ class Page:
     async def __aenter__(self):
         self.session = aiohttp.ClientSession()
         self.socket = await self.session.ws_connect(self.url("/ws"), max_msg_size=0)
-        hello = await self.until(lambda: self.history is not None)
-        assert hello
+        await self.message("hello")
         return self
 
     async def refusal(self):
@@ -48,28 +49,44 @@ class Page:
         await self.session.close()
 
     async def receive(self):
-        message = await asyncio.wait_for(self.socket.receive(), WITHIN_S)
-        if message.type is aiohttp.WSMsgType.TEXT:
-            self.messages.append(json.loads(message.data))
-        elif message.data[:1] == b"F":
-            sizes = [int.from_bytes(message.data[start : start + 4], "little") for start in (1, 5)]
-            middle, end = 9 + sizes[0], 9 + sum(sizes)
-            head = json.loads(message.data[9:middle]) | json.loads(message.data[middle:end])
-            self.frames.append((head, message.data[end:]))
-            if self.acknowledges:
-                await self.socket.send_str(json.dumps({"do": "received"}))
-        elif message.data[8:]:
-            self._parts.append(np.frombuffer(message.data[8:]).reshape(-1, len(COLUMNS)))
-        else:
-            self.history = np.vstack([np.empty((0, len(COLUMNS))), *self._parts])
+        """Receive a turn."""
+        data = (await asyncio.wait_for(self.socket.receive(), WITHIN_S)).data
+        self.turns += 1
+        (length,) = struct.unpack_from("<I", data)
+        turn = json.loads(data[4 : 4 + length])
+        self.messages += turn["messages"]
+        first, count = turn["rows"]
+        self.rows_received += count
+        middle = 4 + length + 8 * TIMES * count
+        end = middle + 4 * (len(COLUMNS) - TIMES) * count
+        times = np.frombuffer(data[4 + length : middle], "<f8").reshape(count, TIMES)
+        others = np.frombuffer(data[middle:end], "<f4").reshape(count, len(COLUMNS) - TIMES)
+        for number, row in enumerate(np.hstack([times, others]), first):
+            self.rows[number] = row
+        if "image" in turn:
+            self.frames.append((turn["image"], data[end:]))
+        if self.acknowledges:
+            await self.acknowledge()
+
+    async def acknowledge(self):
+        """Acknowledge the last turn."""
+        await self.socket.send_str(json.dumps({"do": "received", "at": 1.0}))
+
+    @property
+    def history(self):
+        """The rows that have come, oldest first."""
+        return np.array([self.rows[number] for number in sorted(self.rows)]).reshape(-1, len(COLUMNS))
+
+    def items(self, kind):
+        """Return the items of a log that have come."""
+        return [item for message in self.messages if message["type"] == kind for item in message["items"]]
 
     async def until(self, condition):
         """Receive until a condition holds."""
-        for _ in range(1000):
-            if found := condition():
-                return found
-            await self.receive()
-        raise AssertionError("never came")
+        async with asyncio.timeout(WITHIN_S):
+            while not (found := condition()):
+                await self.receive()
+        return found
 
     async def ask(self, **request):
         """Make a request and return its answer."""

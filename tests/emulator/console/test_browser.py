@@ -3,30 +3,28 @@
 import json
 import math
 import re
-import shutil
 import socket
 import subprocess
-import threading
-import time
 import urllib.error
 import urllib.request
-from contextlib import contextmanager, suppress
 from urllib.parse import urlsplit
 
 import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, installed_command
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
+from tests.emulator.console.browser import (
+    MARKS,
+    WITHIN_MS,
+    chromium,
+    opened,
+    slow_link,
+    wait_for_text,
+)
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-WITHIN_MS = 30_000
 UPDATE_RATE_HZ = 5
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.process,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: as root, apt-get install chromium"),
-]
+pytestmark = MARKS
 
 
 @pytest.fixture(scope="module")
@@ -47,28 +45,14 @@ def emulator():
 
 @pytest.fixture(scope="module")
 def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
+    with chromium() as started:
+        yield started
 
 
 @pytest.fixture
 def page(browser, emulator):
-    """The console's page; whatever the browser's console says is a failure."""
-    opened = browser.new_page(viewport={"width": 1280, "height": 800})
-    opened.set_default_timeout(WITHIN_MS)
-    said = []
-    opened.on("console", lambda message: said.append(message.text))
-    opened.on("pageerror", lambda error: said.append(str(error)))
-    opened.goto(emulator.ready["view"])
-    opened.wait_for_selector("#link[data-state=connected]")
-    opened.wait_for_function("() => starhil.store.hello")
-    yield opened
-    opened.close()
-    assert said == []
+    with opened(browser, emulator.ready["view"]) as page:
+        yield page
 
 
 def send(page, name, **values):
@@ -85,12 +69,6 @@ def send(page, name, **values):
     page.click("#send")
     page.wait_for_function("count => document.querySelectorAll('#sent li').length > count", arg=count)
     return page.locator("#sent li .outcome").first.text_content()
-
-
-def wait_for_text(page, selector, text):
-    page.wait_for_function(
-        "([selector, text]) => document.querySelector(selector).textContent === text", arg=[selector, text]
-    )
 
 
 VALUES = "row => Object.fromEntries([...document.querySelectorAll(`[data-row=${row}] tr`)].map(tr => [tr.cells[0].textContent, tr.cells[1].textContent]))"
@@ -133,7 +111,7 @@ def test_a_covered_lens_is_flagged_within_three_frames_and_the_attitude_recovers
     page.click("[data-tab=faults]")
     before = page.evaluate(newest)
     page.click("#cover")
-    wait_for_text(page, "#cover", "uncover the lens")
+    wait_for_text(page, "#cover", "Uncover the lens")
     covered = page.evaluate(newest)
     wait_for_text(page, "#validity", "too few stars")
     flagged = page.evaluate(
@@ -158,7 +136,7 @@ def test_in_error_mode_no_attitude_is_shown_and_the_last_image_has_its_age(page)
     page.evaluate("starhil.link.control({ do: 'fault', device: { error: 'sensor' } })")
     wait_for_text(page, "#mode", "error: sensor")
     wait_for_text(page, "#validity", "no images")
-    wait_for_text(page, "#error-label", "last valid")
+    wait_for_text(page, "#error-label", "Last valid")
     assert {page.locator(f"#{name}").text_content() for name in ("ra", "dec", "roll")} == {"–"}
     page.wait_for_function(
         "() => /^image of [1-9][0-9]* s ago$/.test(document.getElementById('when').textContent)"
@@ -175,7 +153,10 @@ def test_a_wrong_parameter_shows_the_refusal(page):
     assert "500.0 is outside 0.01 to 100 Hz" in problem
     assert page.locator("#bytes").text_content().splitlines() == [
         "serial   1F 7F 61 00 00 FA 43 1F FF",
+        "as this console:",
         "cansend vcan0 0161FD04#0000FA43",
+        "as OBC 1:",
+        "cansend vcan0 01610104#0000FA43",
     ]
 
 
@@ -199,7 +180,7 @@ def test_a_page_for_viewing_only_has_no_control_that_commands(browser, emulator)
     for tab in ("telemetry", "telecommands", "faults", "truth"):
         opened.click(f"[data-tab={tab}]")
         for button in opened.locator(f"#{tab} button:visible").all():
-            assert button.text_content() == "save as session", tab
+            assert button.text_content() == "save as session" or button.get_attribute("class") == "fold", tab
     opened.click("[data-tab=telecommands]")
     opened.select_option("#telecommand", "set_update_rate")
     opened.wait_for_function("() => document.getElementById('bytes').textContent.includes('cansend')")
@@ -247,7 +228,9 @@ def test_the_page_can_be_paused_scrubbed_and_set_live_again_by_keys(page):
     page.keyboard.press("ArrowLeft")
     page.keyboard.press("ArrowLeft")
     assert page.evaluate(frame) == before - 2
-    page.wait_for_function(f"() => starhil.sky.shown.head.row[2] === {frame}")  # the image of that moment
+    page.wait_for_function(  # the image nearest to that moment: a busy page has not got all of them
+        "() => starhil.sky.shown === starhil.store.image && Math.abs(starhil.sky.shown.time - starhil.store.cursor) <= 0.5"
+    )
     page.keyboard.press("Space")
     page.wait_for_function(f"() => {frame} > {before}")
     assert not page.locator("body.paused").count()
@@ -257,10 +240,10 @@ def test_the_page_paints_at_once_and_every_tab_opens_in_both_themes(page):
     paint = page.evaluate("performance.getEntriesByType('paint')[0].startTime")
     assert paint > 0
     for _ in range(2):
-        for tab in ("telemetry", "telecommands", "wire", "faults", "truth"):
+        for tab in ("telemetry", "telecommands", "wire", "events", "faults", "truth"):
             page.click(f"[data-tab={tab}]")
             assert page.locator(f"#{tab}").is_visible()
-        page.keyboard.press("t")
+        page.click("#theme")
 
 
 def test_content_fits_the_window_at_any_size(page):
@@ -289,12 +272,17 @@ def test_the_page_keeps_eight_hours_of_frames_in_bounded_memory(page):
             store.message(hello);
             const blob = new Blob([new Uint8Array(16)]);
             const width = hello.columns.length;
+            const block = (row) => {
+                const bytes = new ArrayBuffer(16 + 4 * (width - 2));
+                new Float64Array(bytes, 0, 2).set(row.slice(0, 2));
+                return bytes;
+            };
             const begin = store.now + 1;
             let most = 0;
             for (let number = 0; number < 8 * 3600 * 5; number++) {
                 const row = new Array(width).fill(0);
                 row[0] = begin + number / 5;
-                store.rows.push(row);
+                store.rows.read(block(row), 0, number, 1);
                 if (number % 5 === 0) {
                     store.images.push({ time: row[0], head: { row }, blob });
                     store.thin(row[0]);
@@ -305,7 +293,7 @@ def test_the_page_keeps_eight_hours_of_frames_in_bounded_memory(page):
         }"""
     )
     assert kept["rows"] == 36_000
-    assert kept["numbers"] == 72_000
+    assert kept["numbers"] == 36_000
     assert kept["most"] <= 62 + 721
 
 
@@ -334,9 +322,9 @@ def test_a_page_that_connects_to_another_run_shows_nothing_of_the_run_before(pag
         """async () => {
             const { store, sky } = starhil;
             while (sky.decoding) await new Promise(requestAnimationFrame);
-            store.frame = () => {};
-            store.message(store.hello);
-            store.history(new Float64Array(0));
+            store.addImage = () => {};
+            store.read = (buffer, offset, first, count) => offset + 16 * count + 4 * (store.hello.columns.length - 2) * count;
+            store.message({ ...store.hello, run_id: "another" });
             while (sky.decoding) await new Promise(requestAnimationFrame);
             return ["ra", "dec", "roll", "validity"].map((id) => document.getElementById(id).textContent).concat([sky.shown]);
         }"""
@@ -349,43 +337,14 @@ SLOW_BYTES_S = 100_000
 """Rate of a slow link: a third of what images at 5 Hz need."""
 
 
-@contextmanager
-def slow_link(port):
-    """Yield the port of a proxy that passes bytes from a server at `SLOW_BYTES_S`, with small buffers."""
-
-    def pump(source, sink, pause_s):
-        with suppress(OSError):
-            while data := source.recv(2048):
-                sink.sendall(data)
-                time.sleep(len(data) * pause_s)
-        for each in (source, sink):
-            with suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-
-    def serve():
-        with suppress(OSError):
-            while True:
-                client, _ = listener.accept()
-                server = socket.socket()
-                server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8192)
-                server.connect(("127.0.0.1", port))
-                for arguments in ((client, server, 0.0), (server, client, 1.0 / SLOW_BYTES_S)):
-                    threading.Thread(target=pump, args=arguments, daemon=True).start()
-
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        threading.Thread(target=serve, daemon=True).start()
-        yield listener.getsockname()[1]
-        listener.shutdown(socket.SHUT_RDWR)
-
-
 def test_over_a_slow_link_images_are_left_out_and_numbers_are_not(page, browser, emulator):
     track(page)
     port = urlsplit(emulator.ready["view"]).port
-    with slow_link(port) as slow_port:
+    with slow_link(port, SLOW_BYTES_S) as slow_port:
         slow = browser.new_page()
         slow.set_default_timeout(WITHIN_MS)
         slow.goto(emulator.ready["view"].replace(str(port), str(slow_port)))
-        slow.wait_for_function("() => starhil.store.images.length > 0")
+        slow.wait_for_function("() => window.starhil && starhil.store.images.length > 0")
         begin = slow.evaluate("starhil.store.now")
         slow.wait_for_function("begin => starhil.store.now > begin + 9", arg=begin)
         behind_s = page.evaluate("starhil.store.now") - slow.evaluate("starhil.store.images.at(-1).time")
@@ -431,7 +390,7 @@ def test_a_page_whose_emulator_ended_is_grey_and_asks_for_the_address_of_the_nex
     with EmulatorProcess(command) as process:
         page.goto(process.ready["view"])
         page.wait_for_selector("#link[data-state=connected]")
-        page.wait_for_function("() => starhil.store.hello")
+        page.wait_for_function("() => window.starhil && starhil.store.hello")
         assert page.evaluate("document.documentElement.scrollWidth") == 420
         assert page.evaluate("scrollY") == 0
         assert page.locator("#telecommand-form button").count() == 0

@@ -4,13 +4,10 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
-from tests.emulator.console.test_browser import CHROMIUM, browser, page, send  # noqa: F401 (fixtures)
+from tests.emulator.console.browser import MARKS
+from tests.emulator.console.test_browser import browser, page, send  # noqa: F401 (fixtures)
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.process,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: as root, apt-get install chromium"),
-]
+pytestmark = MARKS
 
 SETTINGS = (
     "run.algorithm=rsi", "truth.kind=rate", "truth.attitude.ra_deg=83.8", "truth.attitude.dec_deg=-1.2",

@@ -14,6 +14,7 @@ from starhil.hil_tests.client import AsyncObcClient
 from starhil.hil_tests.client.links import CanHostLink, SerialHostLink
 from starhil.protocol.unit import load_unit
 from tests.emulator.conftest import ORION, PREVIEW
+from tests.emulator.console.pages import OPTIONS, Page
 from tests.emulator.runs import Control, command, every_row_read
 
 ICD = load_unit()
@@ -72,7 +73,9 @@ def test_images_truth_measurements_telemetry_and_events_are_read_back(run, tmp_p
     )  # of the frame, not of its vectors
     measured = found["/measurement"][-1][2]
     assert (measured["valid"], measured["mode"], measured["matched"]) == (True, "tracking", 35)
-    assert "mode standby → lost_in_space (command)" in [event["message"] for _, _, event in found["/events"]]
+    events = [(event["name"], event["message"]) for _, _, event in found["/events"]]
+    assert ("mode", "standby → lost in space (command)") in events
+    assert ("telecommand", "set_mode mode=lost_in_space accepted") in events
     assert found["/telemetry/device_status"][0][2]["mode"] in ("boot", "standby", "lost_in_space", "tracking")
 
 
@@ -96,8 +99,8 @@ def test_faults_traffic_units_and_what_identifies_the_run_are_read_back(run, tmp
     run(scenario, options=options(path, control="auto"))
     found = messages(path)
     events = [event["message"] for _, _, event in found["/events"]]
-    assert 'fault {"optical": {"false_stars": 3}}' in events
-    assert "faults ended" in events
+    assert "begin: optical false_stars 3" in events
+    assert "end: optical false_stars" in events
     assert [faults for _, _, faults in found["/faults"]] == [{"optical": {"false_stars": 3}}, {}]
     serial = [(line["out"], line["kind"], line["text"]) for _, _, line in found["/bus/serial"]]
     assert (False, "telecommand", "set_mode mode=lost_in_space") in serial
@@ -216,3 +219,27 @@ def test_a_clock_telecommand_does_not_destroy_the_recording(run, tmp_path, caplo
     assert truths[-1][2]["timestamp"]["sec"] // 10 == 180_000_000
     (said,) = [each.getMessage() for each in caplog.records if each.levelname in ("WARNING", "ERROR")]
     assert "its times are left out" in said
+
+
+def test_what_the_console_keeps_is_recorded_afterwards(run, tmp_path):
+    path = tmp_path / "later.mcap"
+
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        client = AsyncObcClient(
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd
+        )
+        await client.start()
+        await client.telemetry("identification")
+        await client.close()
+        await emulation.stepper.step(3.0)
+        async with Page(emulation) as page, page.session.get(page.url("/record.mcap")) as response:
+            path.write_bytes(await response.read())
+        assert emulation.device.cycle.published > 0
+
+    run(scenario, options=OPTIONS)
+    found = messages(path)
+    assert found["/measurement"][-1][2]["mode"] == "tracking"
+    assert "standby → lost in space (command)" in [event["message"] for _, _, event in found["/events"]]
+    assert "identification?" in [line["text"] for _, _, line in found["/bus/serial"]]

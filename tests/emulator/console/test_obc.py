@@ -177,12 +177,12 @@ def test_a_page_that_subscribes_to_the_wire_gets_it_decoded(run):
             peer = open(emulation.ready_fields["serial"], "r+b", buffering=0)  # noqa: PTH123, SIM115
             peer.write(bytes.fromhex("1F7FE61FFF"))
             request = await page.message(
-                "wire", lambda item: any("quaternion?" in line["text"] for line in item["lines"])
+                "wire", lambda item: any("quaternion?" in line["text"] for line in item["items"])
             )
-            line = next(line for line in request["lines"] if "quaternion?" in line["text"])
+            line = next(line for line in request["items"] if "quaternion?" in line["text"])
             assert (line["bus"], line["out"], line["raw"]) == ("serial", False, "1F 7F E6 1F FF")
             await page.message(
-                "wire", lambda item: any(line["text"].startswith("quaternion q_x") for line in item["lines"])
+                "wire", lambda item: any(line["text"].startswith("quaternion q_x") for line in item["items"])
             )
             peer.close()
 
@@ -239,8 +239,12 @@ def test_a_unit_with_canopen_only_is_commanded_by_sdo(run):
             await page.ask(do="subscribe", wire=True)
             assert (await page.ask(do="send", row="set_status", values={"status": "4"}))["outcome"] == "ok"
             assert emulation.device.modes.mode == "lost_in_space"
-            traced = await page.message("wire", lambda item: item["lines"])
-            assert traced["lines"][0]["raw"] == shown["cansend"][0]
+            line = await page.until(
+                lambda: next(
+                    (each for each in page.items("wire") if each["raw"] == shown["cansend"][0]), None
+                )
+            )
+            assert line["text"] == "node 44 write 4000h status = lost_in_space"
             refused = await page.ask(do="send", row="set_status", values={"status": "77"})
             assert (refused["outcome"], refused["refused"]) == ("invalid_parameter", True)
             assert (await page.ask(do="read", row="status"))["values"] == {"status": "lost_in_space"}

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import socket
+import struct
 from contextlib import AsyncExitStack
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ import pytest
 
 from starhil.emulator.console import server
 from starhil.emulator.console.console import Console
-from starhil.emulator.console.history import COLUMNS, MODES
+from starhil.emulator.console.history import COLUMNS, MODES, History, Image
 from starhil.emulator.console.reported_runs import ReportedRuns
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
 from starhil.emulator.errors import EmulatorError
@@ -23,7 +24,9 @@ from tests.emulator.console.pages import ALONG_X, OPTIONS, WITHIN_S, Page, colum
 from tests.emulator.runs import command, read
 
 
-@pytest.mark.parametrize("path", ["/", "/runs", "/ws", "/session.toml", "/wire.log"])
+@pytest.mark.parametrize(
+    "path", ["/", "/runs", "/ws", "/session.toml", "/wire.log", "/wire.txt", "/record.mcap", "/docs/console"]
+)
 def test_a_wrong_token_and_another_origin_are_answered_403(run, path):
     async def scenario(emulation, _line):
         right = emulation.ready_fields["view"].replace("/?", f"{path}?")
@@ -199,10 +202,11 @@ def test_a_page_receives_description_history_and_each_frame_with_its_numbers(run
             assert {row["name"] for row in hello["telemetry"]} == set(emulation.device.icd.telemetry)
             assert {row["name"] for row in hello["telecommands"]} == set(emulation.device.icd.telecommands)
             assert hello["star_names"]["27989"] == "Betelgeuse"
+            await page.ask(do="subscribe", frames=True)
+            await page.until(lambda: len(page.rows) >= known)
             frames = page.history[~np.isnan(column(page.history.T, "frame"))]
             assert len(frames) == known
             assert column(frames.T, "error_x") == pytest.approx(1e-5 * 206264.806, rel=1e-3)
-            await page.ask(do="subscribe", frames=True)
             await emulation.stepper.step(1.0)
             head, jpeg = await page.until(lambda: page.frames and page.frames[-1])
             assert jpeg == PREVIEW.jpeg
@@ -225,12 +229,12 @@ def test_an_invalid_frame_has_its_reason_and_no_numbers(run):
         async with Page(emulation) as page:
             await page.ask(do="subscribe", frames=True)
             await emulation.stepper.step(2.0)
-            head, _ = await page.until(lambda: page.frames and page.frames[-1])
-            assert column(head["row"], "valid") == 0
-            assert column(head["row"], "error_cross") is None
+            await page.until(lambda: page.rows and column(page.history[-1], "frame") > 0)
+            row = page.history[-1]
+            assert column(row, "valid") == 0
+            assert np.isnan(column(row, "error_cross"))
             wanted = await page.message("reasons", lambda item: "too_few_stars" in item["reasons"])
-            reasons = wanted["reasons"]
-            assert reasons[int(column(head["row"], "reason"))] == "too_few_stars"
+            assert wanted["reasons"][int(column(row, "reason"))] == "too_few_stars"
 
     run(scenario, options=OPTIONS)
 
@@ -241,15 +245,17 @@ def test_a_mode_without_frames_is_in_the_history_from_its_beginning(run):
         command(emulation, "set_mode", mode="lost_in_space")
         await emulation.stepper.step(2.0)
         async with Page(emulation) as page:
+            await page.ask(do="subscribe", frames=True)
+            await page.until(lambda: len(page.rows) >= 3)
             modes = [MODES[int(number)] for number in column(page.history.T, "mode")]
             assert modes[:3] == ["boot", "standby", "lost_in_space"]
-            await page.ask(do="subscribe", frames=True)
-            begin_s = emulation.clock.now_ns() * 1e-9
+            begin_s, before = emulation.clock.now_ns() * 1e-9, len(page.rows)
             emulation.device.modes.fail("sensor")
-            row = (await page.message("row"))["row"]
+            await page.until(lambda: len(page.rows) > before)
+            row = page.history[-1]
             assert MODES[int(column(row, "mode"))] == "error"
             assert column(row, "run_s") == begin_s
-            assert column(row, "frame") is None
+            assert np.isnan(column(row, "frame"))
             assert column(row, "valid") == 0
             reasons = [item["reasons"] for item in page.messages if item["type"] == "reasons"][-1]
             assert reasons[int(column(row, "reason"))] == "no_images"
@@ -343,24 +349,61 @@ def test_each_head_has_its_own_page_on_a_shared_clock(run):
     run(scenario, options=OPTIONS, others=[second], links=links, parameters=parameters)
 
 
+class KeepingSocket:
+    """Keeps what is sent."""
+
+    def __init__(self):
+        self.sent = []
+
+    async def send_bytes(self, data):
+        self.sent.append(data)
+
+    def turn(self, number=-1):
+        """Return the JSON of a turn, and what follows it."""
+        data = self.sent[number]
+        (length,) = struct.unpack_from("<I", data)
+        return json.loads(data[4 : 4 + length]), data[4 + length :]
+
+
 class StalledSocket:
     """A page that never reads."""
-
-    async def send_str(self, _data):
-        await asyncio.Event().wait()
 
     async def send_bytes(self, _data):
         await asyncio.Event().wait()
 
 
+class Numbers:
+    """A log of which the latest numbers are kept."""
+
+    def __init__(self, end=0, kept=1000):
+        self.end = end
+        self.kept = kept
+
+    @property
+    def start(self):
+        return max(0, self.end - self.kept)
+
+    def texts(self, numbers):
+        return [str(number) for number in numbers]
+
+
+def viewer_of(socket_, history=None, trace=None, events=None):
+    return Viewer(socket_, history or History(), trace or Numbers(), events or Numbers())
+
+
+async def turn(viewer):
+    await viewer.flush()
+    viewer.acknowledge(None)
+
+
 def test_a_page_that_does_not_read_keeps_a_bounded_queue_and_the_newest_image():
     async def scenario():
-        viewer = Viewer(StalledSocket())
+        viewer = viewer_of(StalledSocket())
         pump = asyncio.create_task(viewer.pump())
         messages = 8 * 3600 * 5  # eight hours at 5 Hz
         for number in range(messages):
             viewer.send(str(number))
-            viewer.send_frame(b"%d" % number)
+            viewer.send_image(Image("", b"%d" % number))
             if number % 1000 == 0:
                 await asyncio.sleep(0)
         assert viewer.waiting <= QUEUE_LIMIT + 1
@@ -370,30 +413,58 @@ def test_a_page_that_does_not_read_keeps_a_bounded_queue_and_the_newest_image():
     asyncio.run(scenario())
 
 
-class KeepingSocket:
-    """Keeps what is sent."""
-
-    def __init__(self):
-        self.sent = []
-
-    async def send_str(self, text):
-        self.sent.append(text)
-
-    async def send_bytes(self, data):
-        self.sent.append(data)
-
-
-def test_an_image_waits_until_the_last_is_acknowledged_and_one_that_is_dropped_leaves_its_numbers():
+def test_nothing_is_sent_until_the_last_turn_is_acknowledged_and_then_the_newest_image():
     async def scenario():
         socket_ = KeepingSocket()
-        viewer = Viewer(socket_)
+        viewer = viewer_of(socket_)
         for number in range(4):
-            viewer.send_frame(b"image %d" % number, f"numbers {number}")
+            viewer.send_image(Image(f'"n": {number}', b"jpeg %d" % number))
+            viewer.send(str(number))
             await viewer.flush()
-        assert socket_.sent == [b"image 0", "numbers 1", "numbers 2"]
-        viewer.acknowledge()
+        head, rest = socket_.turn()
+        assert (len(socket_.sent), head["messages"], head["image"]["n"], rest) == (1, [0], 0, b"jpeg 0")
+        viewer.acknowledge(5.0)
         await viewer.flush()
-        assert socket_.sent[3:] == [b"image 3"]
+        head, rest = socket_.turn()
+        assert (len(socket_.sent), head["messages"], head["image"]["n"], rest) == (2, [1, 2, 3], 3, b"jpeg 3")
+        assert head["echo"][0] == 5.0
+        assert head["echo"][1] <= head["at"]
+
+    asyncio.run(scenario())
+
+
+def test_what_a_page_lacks_comes_newest_first_in_parts_and_what_is_new_before_it():
+    async def scenario():
+        socket_, events = KeepingSocket(), Numbers(950)
+        viewer = viewer_of(socket_, events=events)
+        viewer.subscribe(frames=True, wire=False, history=0, events=100)
+        parts = []
+        for _ in range(6):
+            await turn(viewer)
+            parts += [
+                (message["items"][0], message["items"][-1]) for message in socket_.turn()[0]["messages"]
+            ]
+            events.end += len(parts) == 2
+        assert parts == [(750, 949), (550, 749), (950, 950), (350, 549), (150, 349), (100, 149)]
+        viewer.subscribe(frames=False, wire=False, history=0, events=0)
+        events.end += 10
+        viewer.subscribe(frames=True, wire=False, history=0, events=951)  # a page that was hidden for a while
+        await turn(viewer)
+        assert socket_.turn()[0]["messages"][0]["items"] == list(range(951, 961))
+
+    asyncio.run(scenario())
+
+
+def test_a_page_that_is_slow_is_told_how_many_items_of_the_trace_it_has_not_got():
+    async def scenario():
+        socket_, trace = KeepingSocket(), Numbers(100)
+        viewer = viewer_of(socket_, trace=trace)
+        viewer.subscribe(frames=False, wire=True, history=0, events=0)
+        for expected in (0, 800, 0):
+            await turn(viewer)
+            (message,) = socket_.turn()[0]["messages"]
+            assert message["left_out"] == expected
+            trace.end += 1000 if expected == 0 else 10
 
     asyncio.run(scenario())
 
@@ -401,38 +472,36 @@ def test_an_image_waits_until_the_last_is_acknowledged_and_one_that_is_dropped_l
 def test_a_slow_page_gets_only_the_last_of_each_state():
     async def scenario():
         socket_ = KeepingSocket()
-        viewer = Viewer(socket_)
+        viewer = viewer_of(socket_)
         for number in range(100):
-            viewer.send(f"status {number}", state="status")
-            viewer.send(f"rates {number}", state="telemetry rates")
-        viewer.send("row")
+            viewer.send(f'"status {number}"', state="status")
+            viewer.send(f'"rates {number}"', state="telemetry rates")
+        viewer.send('"row"')
         await viewer.flush()
-        assert socket_.sent == ["status 99", "rates 99", "row"]
+        assert socket_.turn()[0]["messages"] == ["status 99", "rates 99", "row"]
 
     asyncio.run(scenario())
 
 
-def test_a_page_that_acknowledges_no_image_gets_the_numbers_of_every_frame(run):
+def test_a_page_that_acknowledges_late_gets_the_numbers_of_every_frame(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         command(emulation, "set_mode", mode="lost_in_space")
         async with Page(emulation) as page:
-            page.acknowledges = False
             await page.ask(do="subscribe", frames=True)
+            page.acknowledges = False
+            await page.receive()
+            before, turns = len(page.rows), page.turns
             await emulation.stepper.step(5.0)
             newest = emulation.device.cycle.published
-            assert newest >= 4
-
-            def numbers():
-                rows = [head["row"] for head, _ in page.frames]
-                rows += [item["row"] for item in page.messages if item["type"] == "row"]
-                return [column(row, "frame") for row in rows]
-
-            await page.until(lambda: len(numbers()) == newest - 1)
-            assert numbers() == list(range(1, newest))
-            assert len(page.frames) == 1
-            await page.socket.send_str(json.dumps({"do": "received"}))
+            assert newest - before >= 3
+            page.acknowledges = True
+            await page.acknowledge()
             await page.until_frame(newest)
+            numbers = [column(row, "frame") for row in page.history]
+            assert [number for number in numbers if number > 0] == list(range(1, newest + 1))
+            assert page.turns <= turns + 3
+            assert len(page.frames) < newest
 
     run(scenario, options=OPTIONS)
 
@@ -459,19 +528,130 @@ def test_the_requests_of_a_page_come_at_most_so_often(run, monkeypatch):
     assert min(np.diff(times)) >= server.PAGE_TURN_S
 
 
-def test_a_long_history_is_sent_in_parts_and_a_row_that_comes_meanwhile_is_among_them(run, monkeypatch):
-    monkeypatch.setattr(server, "HISTORY_PART", 3)
-
+def test_a_page_that_comes_back_gets_the_rows_that_it_lacks_and_no_others(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         command(emulation, "set_mode", mode="lost_in_space")
-        await emulation.stepper.step(5.0)
         async with Page(emulation) as page:
-            frames = column(page.history.T, "frame")
-            assert len(page.history) > 6
-            assert list(frames[~np.isnan(frames)]) == list(range(1, emulation.device.cycle.published + 1))
+            await page.ask(do="subscribe", frames=True)
+            await emulation.stepper.step(3.0)
+            await page.until_frame(emulation.device.cycle.published)
+            await page.ask(do="subscribe", frames=False)  # hidden
+            known = max(page.rows) + 1
+            await emulation.stepper.step(3.0)
+            await page.ask(do="subscribe", frames=True, history=known)
+            newest = emulation.device.cycle.published
+            await page.until(lambda: column(page.history[-1], "frame") == newest)
+            assert sorted(page.rows) == list(range(len(page.rows)))
+            assert len(page.rows) == page.rows_received > known + 2
 
     run(scenario, options=OPTIONS)
+
+
+def test_the_timeline_has_what_happened_before_a_page_was_open_and_notes(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="lost_in_space")
+        await emulation.stepper.step(3.0)
+        async with Page(emulation) as page:
+            await page.ask(do="subscribe", frames=True)
+            await page.ask(do="control", request={"do": "fault", "optical": {"blank": True}})
+            await emulation.stepper.step(1.0)
+            telemetry = [{"row": "precise_attitude", "freeze": "all"}, {"row": "quaternion", "freeze": "all"}]
+            for count in (2, 1):
+                answer = await page.ask(
+                    do="control", request={"do": "fault", "telemetry": telemetry[:count], "phase": None}
+                )
+                assert answer["ok"], answer
+            status = await page.message("status", lambda item: "telemetry" in item["status"]["faults"])
+            assert any(fault.startswith("telemetry: ") for fault in status["heads"][0]["faults"])
+            await page.ask(do="control", request={"do": "clear_faults"})
+            await page.ask(do="send", row="set_unix_time", values={"seconds": "1", "nanoseconds": "0"})
+            await page.ask(do="send", row="set_update_rate", values={"rate": "500"})
+            assert (await page.ask(do="note", text="look here", at_s=2.0))["ok"]
+            assert "must not be empty" in (await page.ask(do="note", text=" "))["error"]
+            assert "at_s" in (await page.ask(do="note", text="x", at_s=1e6))["error"]
+            await page.until(lambda: any(event["kind"] == "note" for event in page.items("events")))
+            events = [
+                (event["kind"], event["text"])
+                for event in sorted(page.items("events"), key=lambda item: item["n"])
+            ]
+            kinds = [kind for kind, _ in events]
+            assert ("telecommand", "set_mode mode=lost_in_space accepted") in events
+            assert ("mode", "standby → lost in space (command)") in events
+            assert ("attitude", "valid") in events
+            assert ("fault", "begin: optical blank true") in events
+            assert ("fault", "end: optical blank") in events
+            assert ("fault", 'end: telemetry {"row": "quaternion", "freeze": "all"}') in events
+            assert ("telecommand", "console: set_update_rate rate=500 refused: invalid_parameter") in events
+            assert "clock" in kinds
+            assert events[-1] == ("note", "look here")
+            assert kinds[0] == "mode"
+
+    run(scenario, options=OPTIONS)
+
+
+def test_what_any_page_sends_is_listed_on_all_pages(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page, Page(emulation) as other:
+            await page.ask(do="send", row="set_mode", values={"mode": "lost_in_space"})
+            (item,) = (await other.message("sent", lambda message: message["items"]))["items"]
+            assert (item["row"], item["values"], item["outcome"]) == (
+                "set_mode",
+                {"mode": "lost_in_space"},
+                "ok",
+            )
+        async with Page(emulation) as later:
+            assert [item["row"] for item in (await later.message("sent"))["items"]] == ["set_mode"]
+
+    run(scenario, options=OPTIONS)
+
+
+def test_a_message_of_the_trace_is_returned_with_its_fields_and_what_sends_it(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation) as page:
+            await page.ask(do="subscribe", wire=True)
+            await page.ask(do="send", row="set_mode", values={"mode": "lost_in_space"})
+            line = await page.until(
+                lambda: next((each for each in page.items("wire") if "set_mode" in each["text"]), None)
+            )
+            message = await page.ask(do="message", n=line["n"])
+            assert (message["row"], message["python"]) == (
+                "set_mode",
+                "client.command('set_mode', mode='lost_in_space')",
+            )
+            assert message["fields"] == [
+                {"name": "mode", "value": "lost_in_space", "unit": "", "start": 0, "end": 1}
+            ]
+            assert "no longer kept" in (await page.ask(do="message", n=10**9))["error"]
+            text = await page.get("/wire.txt")
+            assert "set_mode mode=lost_in_space" in text
+
+    run(scenario, options=OPTIONS)
+
+
+def test_text_is_compressed(run):
+    async def scenario(emulation, _line):
+        base = emulation.ready_fields["view"].partition("/?")[0]
+        async with (
+            aiohttp.ClientSession(auto_decompress=False) as session,
+            session.get(f"{base}/static/js/main.js") as response,
+        ):
+            assert response.headers["Content-Encoding"] in ("gzip", "deflate")
+            assert len(await response.read()) < (server.STATIC / "js" / "main.js").stat().st_size / 2
+
+    run(scenario, options=OPTIONS)
+
+
+def test_a_token_that_is_given_is_that_of_the_address(run):
+    async def scenario(emulation, _line):
+        assert emulation.ready_fields["view"].endswith("?token=of%20the%20bench")
+        async with Page(emulation) as page:
+            assert page.messages[0]["view_only"] is False
+
+    run(scenario, options=replace(OPTIONS, console=replace(OPTIONS.console, command_token="of the bench")))
 
 
 def test_a_session_reports_its_results_to_the_console_as_they_arrive(run):
@@ -494,6 +674,24 @@ def test_a_session_reports_its_results_to_the_console_as_they_arrive(run):
         async with Page(emulation) as later:  # the report after the run
             report = await later.message("run")
             assert [result["name"] for result in report["results"]] == ["the device answers", "it tracks"]
+
+    run(scenario, options=OPTIONS)
+
+
+def test_a_result_that_takes_longer_than_an_idle_connection_lives_is_reported(run, monkeypatch):
+    monkeypatch.setattr(server, "REQUEST_S", 0.2)
+
+    async def scenario(emulation, _line):
+        async with Page(emulation) as page:
+            feed = await asyncio.to_thread(
+                RunFeed, emulation.ready_fields["view"], kind="session", title="", unit="", planned=2
+            )
+            for name in ("first", "second"):
+                await asyncio.sleep(1.0)
+                feed.result(id=name, name=name, status="passed")
+                await page.message("result", lambda item, name=name: item["result"]["name"] == name)
+            await asyncio.to_thread(feed.close)
+            await page.message("run", lambda item: item["end_s"] is not None)
 
     run(scenario, options=OPTIONS)
 

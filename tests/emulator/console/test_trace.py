@@ -1,11 +1,16 @@
 """Decoding of the traffic trace."""
 
+import json
+import struct
+
 import pytest
 
-from starhil.emulator.console.trace import DECODED_PER_TURN, WireTrace
+from starhil.emulator.console.pcapng import pcapng
+from starhil.emulator.console.trace import DECODED, WireTrace
 from starhil.emulator.links.traffic import Decoder, Traffic, WireItem, canopen_text
 from starhil.protocol.can.cubespace import encode_reply_frames, encode_request_frames
 from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
@@ -95,24 +100,82 @@ def test_the_latest_items_are_decoded_once_however_many_pages_ask(monkeypatch):
     monkeypatch.setattr(Decoder, "line", noted)
     traffic = Traffic()
     trace = WireTrace(load_unit(), traffic, lambda: None, str)
-    trace.listen(wanted=True)
 
     def pass_by(count):
         for _ in range(count):
             traffic.passed.emit(WireItem(0.0, "serial", outgoing=False, item=bytes.fromhex("1F7FE61FFF")))
 
+    def numbers(start):
+        while trace.decode():
+            pass
+        return [json.loads(text)["n"] for text in trace.texts(range(start, trace.end))]
+
     pass_by(2)
-    assert [each["n"] for each in trace.recent(0)] == [0, 1]
+    assert numbers(0) == [0, 1]
     pass_by(3)
     for _ in range(10):
-        assert [each["n"] for each in trace.recent(0)] == [0, 1, 2, 3, 4]
-        assert [each["n"] for each in trace.recent(3)] == [3, 4]
+        assert numbers(0) == [0, 1, 2, 3, 4]
+        assert numbers(3) == [3, 4]
     assert len(decoded) == 5
-    pass_by(3 * DECODED_PER_TURN)
+    pass_by(3 * DECODED)
     for _ in range(10):
-        latest = trace.recent(0)
-        assert [each["n"] for each in latest] == list(
-            range(5 + 2 * DECODED_PER_TURN, 5 + 3 * DECODED_PER_TURN)
-        )
-        assert "quaternion?" in latest[-1]["text"]
-    assert len(decoded) == 5 + DECODED_PER_TURN
+        assert numbers(0) == list(range(5 + 2 * DECODED, 5 + 3 * DECODED))
+    assert len(decoded) == 5 + DECODED
+
+
+def test_frames_of_canopen_have_index_name_and_value():
+    objects = DeviceDictionary(ICD)
+    decoder = Decoder(ICD, lambda: None, objects)
+
+    def line(can_id, data, outgoing=False):
+        frame = CanFrame(can_id, bytes.fromhex(data), extended=False)
+        found = decoder.line(WireItem(0.0, "can", outgoing, frame))
+        return found["kind"], found["text"]
+
+    assert line(0x62C, "4018100100000000") == (
+        "telemetry",
+        "node 44 read 1018h:01h Identity object.Vendor-ID",
+    )
+    kind, text = line(0x5AC, "4318100178563412", outgoing=True)
+    assert (kind, text) == ("reply", f"node 44 1018h:01h Identity object.Vendor-ID = {0x12345678}")
+    assert line(0x62C, "2B171000E8030000") == (
+        "telecommand",
+        "node 44 write 1017h Producer heartbeat time = 1000",
+    )
+    assert line(0x5AC, "6017100000000000") == ("ack", "node 44 written 1017h Producer heartbeat time")
+    kind, text = line(0x5AC, "8017100030000906")
+    assert kind == "nack"
+    assert "refused: 0x06090030" in text
+    assert line(0x5AC, "4108100009000000")[1].endswith("follows in segments")
+    line(0x62C, "4008100000000000")
+    assert line(0x5AC, "00") == ("canopen", "COB-ID 5AC")
+    assert line(0x5AC, "0061626364656667")[0] == "part"
+    kind, text = line(0x5AC, "0B68690000000000")
+    assert (kind, text.rpartition(" = ")[2]) == ("reply", "abcdefghi"[:9])
+    assert line(0x72C, "05") == ("canopen", "node 44 heartbeat: operational")
+    assert line(0x000, "012C") == ("canopen", "NMT start, node 44")
+    assert line(0x0AC, "3081010000000000") == ("fault", "node 44 EMCY 8130h, register 01h")
+    assert "TPDO 1 " in line(0x1AC, "0000000000000000", outgoing=True)[1]
+
+
+def test_traffic_of_the_line_of_the_console_is_marked_as_its_own():
+    found = Decoder(ICD, lambda: Dialect.B).line(
+        WireItem(0.0, "console", outgoing=False, item=CUBESPACE.encode_request(Request.of(STATUS.id)))
+    )
+    assert (found["own"], found["text"]) == (True, "device_status?")
+
+
+def test_traffic_is_saved_as_pcapng(tmp_path):
+    items = [
+        WireItem(1.5, "can", outgoing=True, item=CanFrame(0x123, b"\x01\x02", extended=False)),
+        WireItem(2.5, "serial", outgoing=False, item=b"\x1f\x7f"),
+    ]
+    data = pcapng(items)
+    blocks, at = [], 0
+    while at < len(data):
+        kind, size = struct.unpack_from("<II", data, at)
+        assert struct.unpack_from("<I", data, at + size - 4) == (size,)
+        blocks.append(kind)
+        at += size
+    assert blocks == [0x0A0D0D0A, 1, 6, 1, 6]
+    assert struct.pack(">IB3x", 0x123, 2) + b"\x01\x02" in data

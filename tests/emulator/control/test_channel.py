@@ -47,6 +47,45 @@ def test_time_passes_only_by_steps(run):
     run(scenario)
 
 
+def test_a_wait_ends_at_a_phase_of_the_next_exposure(run):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            answer = await control.do("wait", phase="exposure", within_s=3.0)
+            assert answer["error"] == "wait: no exposure has begun within 3 s (mode standby)"
+            command(emulation, "set_mode", mode="lost_in_space")
+            begins = [(await control.do("wait", phase="exposure"))["run_time_s"] for _ in range(3)]
+            period_s = 1.0 / float(emulation.device.parameters["update_rate"])
+            assert begins[2] - begins[1] == pytest.approx(period_s)
+            exposure_s = emulation.device.cycle.exposure_s
+            (mid,) = [(await control.do("wait", phase="mid_frame"))["run_time_s"]]
+            assert (mid - begins[2]) % period_s == pytest.approx(exposure_s / 2.0)
+            for wrong in ({}, {"seconds": 1.0}, {"phase": "exposur"}, {"seconds": 1.0, "phase": "exposure"}):
+                assert not (await control.do("wait", **wrong))["ok"]
+
+    run(scenario)
+
+
+def test_a_fault_acts_at_its_phase_unless_all_are_cleared_before(run):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            await control.do("step", seconds=1.0)
+            command(emulation, "set_mode", mode="lost_in_space")
+            answer = await control.do("fault", phase="mid_frame", device={"error": "sensor"})
+            assert answer["ok"]
+            assert (await control.do("wait", phase="exposure"))["ok"]
+            assert (await control.do("status"))["mode"] == "lost_in_space"
+            await control.do("step", seconds=emulation.device.cycle.exposure_s / 2.0)
+            assert (await control.do("status"))["mode"] == "error"
+            command(emulation, "set_mode", mode="standby")
+            await control.do("fault", phase="exposure", device={"error": "sensor"})
+            await control.do("clear_faults")
+            command(emulation, "set_mode", mode="lost_in_space")
+            await control.do("step", seconds=3.0)
+            assert (await control.do("status"))["mode"] == "tracking"
+
+    run(scenario)
+
+
 def test_truth_is_read_back_and_swapped_while_running(run):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:

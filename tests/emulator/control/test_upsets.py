@@ -10,7 +10,7 @@ THRESHOLD_BIT = 22
 
 
 def inject(bench, **upset):
-    faults = Faults(bench.device, {})
+    faults = Faults(bench.requests, {})
     faults.inject(FaultRequest.model_validate({"device": {"upset": upset}}))
     return faults
 

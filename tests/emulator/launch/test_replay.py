@@ -100,6 +100,31 @@ def test_a_run_is_repeated_to_the_byte(record, clock, tmp_path):
     assert (folder / "truth.csv").read_text().count("\n") >= 9
 
 
+@pytest.mark.parametrize("clock", ["real", "stepped"])
+def test_faults_of_telemetry_and_waits_for_a_phase_are_repeated_to_the_byte(record, clock):
+    faults = [
+        {"row": "precise_attitude", "offset": {"q_x": 0.1}, "jump_deg": 3.0, "probability": 0.5},
+        {"row": "device_status", "truncate": 1, "count": 3},
+    ]
+
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+        async with Control(emulation) as control:
+            assert (await control.do("wait", phase="mid_frame"))["ok"]
+            assert (await control.do("fault", telemetry=faults, phase="exposure"))["ok"]
+            assert (await control.do("wait", phase="readout"))["ok"]
+        await talk_over_a_bad_wire(emulation)
+        async with Control(emulation) as control:
+            assert len((await control.do("status"))["faults"]["telemetry"]) == 2
+            await control.do("clear_faults")
+        await talk(emulation, 8)
+
+    folder = record(scenario, clock=clock, run={"clock": clock})
+    report = report_of(folder)
+    assert report.differences == []
+    assert report.sent["serial"] > 1000
+
+
 def test_runs_with_other_state_folders_are_recorded_alike(tmp_path):
     written = []
     for name in ("one", "two"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
+from collections import Counter
 from fractions import Fraction
 
 import pytest
@@ -20,6 +21,7 @@ from starhil.emulator.links.canopen import (
     open_canopen,
     rows_reporting,
 )
+from starhil.emulator.run.faults import FaultRequest, Faults
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.context import NmtState
 from starhil.protocol.canopen.storage import FileStorage, ParameterStorage
@@ -402,3 +404,39 @@ def test_damaged_frames_stay_frames_of_the_base_format(data):
         assert not damaged.extended
         assert not pieces.junk(rng).extended
     assert pieces.split(frame, 3) == [frame]
+
+
+def test_pdos_and_sdo_answers_of_a_faulty_row_are_altered_and_no_others(linked):
+    def test(link):
+        link.frame(0, f"01{NODE:02x}")
+        link.sdo("2f 00 60 00 02")
+        link.step(3.0)
+        row = link.bench.icd.telemetry["precise_attitude"]
+        faults = Faults(link.bench.requests, {"canopen": link.link})
+
+        def inject(**fault):
+            faults.inject(FaultRequest(telemetry={"row": row.name, **fault}))
+
+        usual = link.upload(0x2000, row.id)
+        inject(set={"q_x": 0.25})
+        assert row.decode(link.upload(0x2000, row.id))["q_x"] == 0.25
+        assert link.upload(0x2000, row.id)[-2:] == usual[-2:]
+        inject(duplicate=True)
+        sent = Counter(identifier - NODE for identifier, _ in link.step(1.0))
+        assert (sent[0x280], sent[0x380], sent[0x480], sent[0x700]) == (2, 2, 2, 1)
+        inject(drop=True)
+        assert link.frame(0x600 + NODE, f"400020{row.id:02x}00000000") == []
+        assert link.upload(0x2000, link.bench.icd.telemetry["identification"].id)
+        inject(answer_with="identification")
+        assert link.sdo(f"40 00 20 {row.id:02x}").startswith("41002080")
+        inject(wrong_sequence=True)
+        link.sdo(f"40 00 20 {row.id:02x}")
+        assert int(link.sdo("60")[:2], 16) & 0x10
+        inject(wrong_id=0x123)
+        assert [identifier for identifier, _ in link.frame(0x600 + NODE, f"400020{row.id:02x}00000000")] == [
+            0x123
+        ]
+        faults.clear()
+        assert len(link.upload(0x2000, row.id)) == row.size
+
+    linked(test)

@@ -1,4 +1,4 @@
-"""Fuzzing of the whole slave: frames near good ones in any order, 100 000 of them (STARHIL_FUZZ_INPUTS sets another number)."""
+"""Fuzzing of the whole slave: frames near good ones in any order, 20 000 of them (STARHIL_FUZZ_INPUTS sets another number)."""
 
 from __future__ import annotations
 

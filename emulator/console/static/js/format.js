@@ -63,6 +63,7 @@ export function limits(field) {
 
 export function short(number) {
   if (number === null || number === undefined) return "";
+  if (typeof number === "string") return number.replace("-", MINUS); // too large for a number of the page
   const text = Number.isInteger(number) ? String(number) : String(Number(number.toPrecision(6)));
   return text.replace("-", MINUS);
 }
@@ -89,4 +90,41 @@ export function press(button, on) {
 
 export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
+}
+
+// Tell those who hear the page the outcome of what they did.
+export function say(text) {
+  if (text) document.getElementById("said").textContent = text;
+}
+
+// Offer a file that the page has made.
+export function save(name, blob) {
+  const url = URL.createObjectURL(blob);
+  make("a", { href: url, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(url), 1000);
+}
+
+// Text with `code` in it, as elements.
+export function prose(text) {
+  return text.split("`").map((part, number) => (number % 2 ? make("code", { text: part }) : part));
+}
+
+// The number in a field, or a reason why it is none, or not in its range.
+export function number(text, low, high) {
+  const item = Number(text);
+  if (text.trim() === "" || !Number.isFinite(item)) return { problem: `“${text}” is not a number` };
+  if (low !== undefined && low !== null && item < Number(low)) return { item, problem: `${text} is below ${short(low)}` };
+  if (high !== undefined && high !== null && item > Number(high)) return { item, problem: `${text} is above ${short(high)}` };
+  return { item, problem: "" };
+}
+
+// Ask before something that cannot be taken back; resolve with the answer chosen, "" for none.
+export function ask(text, ...answers) {
+  const dialog = document.getElementById("ask");
+  document.getElementById("ask-text").textContent = text;
+  dialog.querySelector("form").replaceChildren(
+    ...answers.map((answer) => make("button", { value: answer, class: "primary", text: answer })), make("button", { value: "", text: "cancel" }));
+  dialog.returnValue = "";
+  dialog.showModal();
+  return new Promise((resolve) => dialog.addEventListener("close", () => resolve(dialog.returnValue), { once: true }));
 }

@@ -1,35 +1,46 @@
-// The WebSocket to the emulator: requests with answers, messages, frames, and reconnection.
+// The WebSocket to the emulator: requests with answers, turns, and reconnection.
+//
+// A turn is all that the server has for the page: messages, rows of the history, an image. The next one comes when this one is
+// acknowledged, so that nothing queues on the way. The acknowledgement has the page's time, which the server returns with its
+// own: so the page knows how old a turn is.
 
 const QUERY = new URLSearchParams(location.search);
 const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 5000;
-const FRAME = 70; // "F"
+const KEPT_REPLIES = 20_000;
 
 // The address of a path, for the head of this page or another one.
-export function address(path, head = QUERY.get("head")) {
-  const query = new URLSearchParams({ token: QUERY.get("token") || "", ...(head && { head }) });
+export function address(path, head = QUERY.get("head"), more = {}) {
+  const query = new URLSearchParams({ token: QUERY.get("token") || "", ...(head && { head }), ...more });
   return `${path}?${query}`;
 }
 
 export class Link {
-  constructor({ message, frame = () => {}, history = () => {}, state }) {
-    this.handlers = { message, frame, history, state };
+  // `known` returns the numbers of the next row and the next event that the page lacks.
+  constructor({ message, image, rows, state, known }) {
+    this.handlers = { message, image, rows, state, known };
     this.wanted = { frames: false, wire: false, rows: [] };
     this.waiting = new Map();
     this.next = 1;
     this.retry = FIRST_RETRY_MS;
-    this.connect();
+    this.replies = []; // simulation time, and how long a reply to this console took, ms; null if none came
+    this.offset = Infinity;
+    this.newest = null;
+    this.described = false;
+    this.socket = { readyState: WebSocket.CLOSED };
   }
 
   connect() {
     this.handlers.state("connecting");
+    this.offset = Infinity; // of the server's clock, ms; too large by what an acknowledgement takes
+    this.newest = null; // when the newest turn was made, by the page's clock
+    this.described = false;
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     const socket = new WebSocket(`${scheme}://${location.host}${address("/ws")}`);
     socket.binaryType = "arraybuffer";
     socket.onopen = () => {
       this.retry = FIRST_RETRY_MS;
       this.handlers.state("connected");
-      this.send();
     };
     socket.onmessage = (event) => this.receive(event.data);
     socket.onclose = () => {
@@ -54,28 +65,40 @@ export class Link {
   }
 
   receive(data) {
-    if (typeof data === "string") {
-      const message = JSON.parse(data);
-      if (message.type === "answer") {
-        const answer = this.waiting.get(message.id);
-        this.waiting.delete(message.id);
-        if (answer) answer(message);
-      } else {
-        this.handlers.message(message);
-      }
+    const now = performance.now();
+    this.socket.send(JSON.stringify({ do: "received", at: now }));
+    const length = new DataView(data).getUint32(0, true);
+    const turn = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+    if (turn.echo) this.offset = Math.min(this.offset, turn.echo[1] - turn.echo[0]);
+    this.newest = turn.at;
+    for (const message of turn.messages) this.dispatch(message);
+    const end = this.handlers.rows(data, 4 + length, ...turn.rows);
+    if (turn.image) this.handlers.image(turn.image, new Blob([new Uint8Array(data, end)], { type: "image/jpeg" }));
+  }
+
+  dispatch(message) {
+    if (message.type === "answer") {
+      const answer = this.waiting.get(message.id);
+      this.waiting.delete(message.id);
+      if (answer) answer(message);
       return;
     }
-    const bytes = new DataView(data);
-    if (bytes.getUint8(0) === FRAME) {
-      const [numbers, overlay] = [bytes.getUint32(1, true), bytes.getUint32(5, true)];
-      const parse = (start, length) => JSON.parse(new TextDecoder().decode(new Uint8Array(data, start, length)));
-      const head = { ...parse(9, numbers), ...parse(9 + numbers, overlay) };
-      const image = new Uint8Array(data, 9 + numbers + overlay);
-      this.handlers.frame(head, image.length ? new Blob([image], { type: "image/jpeg" }) : null);
-      this.socket.send('{"do": "received"}'); // the next image comes then
-    } else {
-      this.handlers.history(new Float64Array(data, 8));
+    this.handlers.message(message);
+    if (message.type === "hello") {
+      this.described = true;
+      this.send();
     }
+  }
+
+  // Age of the newest turn, s: what the page shows is as old.
+  get age() {
+    return this.newest === null || !Number.isFinite(this.offset) ? 0 : Math.max(0, performance.now() + this.offset - this.newest) / 1000;
+  }
+
+  // Note how long a reply to this console took.
+  noteReply(time, { latency_ms: taken }) {
+    this.replies.push([time, taken ?? null]);
+    if (this.replies.length > KEPT_REPLIES) this.replies.shift();
   }
 
   // Resolve with the answer; its `ok` reports whether the request was executed.
@@ -99,10 +122,10 @@ export class Link {
     this.send();
   }
 
-  // A hidden page has no subscriptions.
+  // A hidden page has no subscriptions; when it is shown again, it gets what it lacks.
   send() {
-    if (this.socket.readyState !== WebSocket.OPEN) return;
+    if (!this.described || this.socket.readyState !== WebSocket.OPEN) return;
     const wanted = document.hidden ? { frames: false, wire: false, rows: [] } : this.wanted;
-    this.request({ do: "subscribe", ...wanted });
+    this.request({ do: "subscribe", ...wanted, ...this.handlers.known() });
   }
 }

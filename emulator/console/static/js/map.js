@@ -3,8 +3,10 @@
 import { drawRegion } from "./features.js";
 import { colour, onTheme, pen } from "./theme.js";
 
+const REDRAW_MS = 200;
 const RAD = Math.PI / 180;
 const TRAIL_POINTS = 600;
+const SIDE_PARTS = 48; // of a side of the field of view: near a pole its right ascension changes fast
 
 export class SkyMap {
   constructor(store) {
@@ -12,10 +14,20 @@ export class SkyMap {
     this.canvas = document.getElementById("allsky");
     this.base = null;
     store.on("hello", () => this.redraw());
-    store.on("shown", () => this.draw());
-    store.on("cursor", () => this.draw());
+    store.on("shown", () => this.schedule());
+    store.on("cursor", () => this.schedule());
     onTheme(() => this.redraw());
     new ResizeObserver(() => this.redraw()).observe(this.canvas.parentElement);
+  }
+
+  // Draw at most so often: the trail of an hour changes little from frame to frame.
+  schedule() {
+    if (this.due) return;
+    this.due = true;
+    setTimeout(() => requestAnimationFrame(() => {
+      this.due = false;
+      this.draw();
+    }), REDRAW_MS);
   }
 
   // Right ascension increases to the left, as seen in the sky; 12 h is at the centre.
@@ -60,22 +72,23 @@ export class SkyMap {
       context.fill();
     }
     context.fillStyle = colour("dim");
-    context.font = `${Math.max(9, this.radius / 12)}px system-ui, sans-serif`;
+    context.font = `${Math.max(12, this.radius / 12)}px system-ui, sans-serif`;
     context.textAlign = "center";
     for (const hours of [0.01, 6, 12, 18]) context.fillText(`${Math.round(hours)}h`, ...this.place(15 * hours, -7));
     this.base = base;
     this.draw();
   }
 
-  // A line, interrupted where it crosses the edge of the map.
+  // A line, interrupted where it crosses the edge of the map: between two points on either side of 0 h.
   line(context, points) {
     context.beginPath();
     let last = null;
     for (const [ra, dec] of points) {
       const here = this.place(ra, dec);
-      if (last && Math.abs(here[0] - last[0]) < this.radius) context.lineTo(...here);
+      const crosses = last !== null && Math.abs(((180 - ra + 540) % 360) - ((180 - last + 540) % 360)) > 180;
+      if (last !== null && !crosses) context.lineTo(...here);
       else context.moveTo(...here);
-      last = here;
+      last = ra;
     }
     context.stroke();
   }
@@ -97,7 +110,7 @@ export class SkyMap {
     for (let i = position; i >= rows.start && trail.length < TRAIL_POINTS; i -= step) if (rows.isFrame(i)) trail.push([rows.at(i, "true_ra"), rows.at(i, "true_dec")]);
     if (!trail.length) return;
     context.lineWidth = 2 * pen();
-    context.font = `${Math.max(10, this.radius / 11)}px system-ui, sans-serif`;
+    context.font = `${Math.max(12, this.radius / 11)}px system-ui, sans-serif`;
     context.strokeStyle = colour("b");
     this.line(context, trail);
     const head = store.image && store.image.head;
@@ -132,9 +145,9 @@ export class SkyMap {
     const corners = [[0, 0], [head.width, 0], [head.width, head.height], [0, head.height], [0, 0]];
     const points = [];
     for (let side = 0; side < 4; side++) {
-      for (let part = 0; part < 8; part++) {
-        const x = corners[side][0] + ((corners[side + 1][0] - corners[side][0]) * part) / 8;
-        const y = corners[side][1] + ((corners[side + 1][1] - corners[side][1]) * part) / 8;
+      for (let part = 0; part < SIDE_PARTS; part++) {
+        const x = corners[side][0] + ((corners[side + 1][0] - corners[side][0]) * part) / SIDE_PARTS;
+        const y = corners[side][1] + ((corners[side + 1][1] - corners[side][1]) * part) / SIDE_PARTS;
         points.push(toSky([(x - centre[0]) / focal[0], (y - centre[1]) / focal[1], 1], head.true_q));
       }
     }

@@ -16,6 +16,12 @@ export class Runs {
     store.on("result", add);
     $("only-failed").addEventListener("change", show);
   }
+
+  // Title of a run that is in progress; empty if there is none.
+  get running() {
+    const [run] = [...runs.values()].filter((each) => each.end_s === null);
+    return run ? run.title : "";
+  }
 }
 
 function begin(message) {

@@ -1,11 +1,12 @@
 // The sensor image with matched, unmatched and missing stars.
 
 import { drawRemoved } from "./features.js";
-import { fixed, press, setText } from "./format.js";
+import { fixed, press, save, say, setText } from "./format.js";
 import { colour, onTheme, pen } from "./theme.js";
 
 const HOVER_PX = 14;
 const MAX_ZOOM = 16;
+const SPOKEN_MS = 5000;
 
 export class Sky {
   constructor(store) {
@@ -22,6 +23,8 @@ export class Sky {
     this.shown = null;
     this.pointer = null;
     this.decoding = false;
+    this.stars = []; // what can be pointed at: place and text
+    this.chosen = -1; // number of the star chosen by keys
     this.painted = 0; // images drawn since the page was opened
     store.on("shown", () => this.show());
     store.on("status", () => this.show());
@@ -39,11 +42,15 @@ export class Sky {
     stretch.addEventListener("input", apply);
     apply();
     document.getElementById("zoom-reset").addEventListener("click", () => this.reset());
+    document.getElementById("save-image").addEventListener("click", () => this.png());
+    this.stage.addEventListener("keydown", (event) => this.key(event));
     this.stage.addEventListener("wheel", (event) => {
+      if (this.zoom === 1 && event.deltaY > 0) return; // the page scrolls on
       event.preventDefault();
       this.zoomAt(event.offsetX, event.offsetY, Math.exp(-event.deltaY / 400));
     }, { passive: false });
     this.stage.addEventListener("pointerdown", (event) => {
+      if (event.pointerType === "touch" && this.zoom === 1) return; // a swipe scrolls the page
       this.drag = [event.clientX, event.clientY, ...this.offset];
       this.stage.setPointerCapture(event.pointerId);
     });
@@ -62,6 +69,37 @@ export class Sky {
       this.pointer = null;
       this.hover.hidden = true;
     });
+  }
+
+  // Pan with Shift and arrows; go from star to star with n and p.
+  key(event) {
+    const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    if (step && event.shiftKey) {
+      for (const axis of [0, 1]) this.offset[axis] += (40 * step[axis]) / this.scale();
+      this.draw();
+    } else if ((event.key === "n" || event.key === "p") && this.stars.length && !event.ctrlKey) {
+      this.chosen = (this.chosen + (event.key === "n" ? 1 : -1) + this.stars.length) % this.stars.length;
+      const [x, y, text] = this.stars[this.chosen];
+      this.pointer = this.place(x, y);
+      this.point();
+      say(text.replaceAll("\n", ", "));
+    } else return;
+    event.preventDefault();
+    event.stopPropagation();
+  }
+
+  // The image with its marks, as shown.
+  png() {
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [this.image.width, this.image.height];
+    const context = canvas.getContext("2d");
+    context.fillStyle = colour("sky");
+    context.fillRect(0, 0, canvas.width, canvas.height);
+    context.filter = this.image.style.filter;
+    context.drawImage(this.image, 0, 0);
+    context.filter = "none";
+    context.drawImage(this.overlay, 0, 0);
+    canvas.toBlob((blob) => save("starhil-image.png", blob));
   }
 
   toggle(layer) {
@@ -109,7 +147,7 @@ export class Sky {
   async show() {
     if (this.decoding) return;
     const { image, hello, stepping } = this.store;
-    if (!image) this.say(hello && hello.clock === "stepped" && !stepping ? "no image: the clock is stopped, step it to take one" : "no image");
+    if (!image) this.say(this.reason(hello, stepping));
     if (image === this.shown) return;
     this.decoding = true;
     const bitmap = image && await createImageBitmap(image.blob).catch(() => null);
@@ -119,8 +157,30 @@ export class Sky {
     this.shown = image;
     this.painted += bitmap ? 1 : 0;
     if (image) this.say(bitmap ? "" : "this image cannot be decoded");
+    this.stars = image ? this.describe(image.head) : [];
+    this.chosen = -1;
+    this.speak();
     this.draw();
     if (this.store.image !== image) this.show();
+  }
+
+  // The image in words, for those who do not see it; not as it changes.
+  speak() {
+    const now = performance.now();
+    if (now - (this.spoken || -Infinity) < SPOKEN_MS) return;
+    this.spoken = now;
+    const { head } = this.shown || {};
+    const names = head ? head.hips.map((hip) => this.store.hello.star_names[hip]).filter(Boolean) : [];
+    setText(document.getElementById("stage-text"), head ? `${(head.detections || []).length} stars detected, ${head.hips.filter(Boolean).length} matched${names.length ? `, among them ${names.slice(0, 5).join(", ")}` : ""}. n and p go from star to star, Shift with arrows moves the enlarged image.` : "no image");
+  }
+
+  // Why there is no image, and what to do.
+  reason(hello, stepping) {
+    if (hello && hello.clock === "stepped" && !stepping) return "no image: the clock is stopped, step it to take one";
+    const { status } = this.store;
+    if (!status || status.mode !== "standby") return "no image";
+    const command = hello.telecommands.find((row) => row.name === "set_mode");
+    return command ? "Standby: send set_mode lost_in_space for images" : "Standby: command a mode with images";
   }
 
   // Show why there is no image.
@@ -228,7 +288,7 @@ export class Sky {
   }
 
   font() {
-    return `${Math.max(11, this.stage.clientWidth / 48)}px system-ui, sans-serif`;
+    return `${Math.max(12, this.stage.clientWidth / 48)}px system-ui, sans-serif`;
   }
 
   drawStars(context, head) {
@@ -240,16 +300,17 @@ export class Sky {
     const inks = { matched: colour("on-sky-matched"), unmatched: colour("on-sky-unmatched") };
     const half = Math.max(2, size * 0.4);
     (head.detections || []).forEach(([x, y, magnitude], number) => {
-      const hip = head.hips[number];
+      const used = Boolean(head.hips[number]);
+      const hip = head.hips[number] || head.unused[number];
       const layer = hip ? "matched" : "unmatched";
       if (!this.layers[layer]) return;
-      const name = names[hip || head.unused[number]];
+      const name = names[hip];
       const [px, py] = this.place(x, y);
       if (name && (magnitude < 2.6 || this.zoom > 2)) labels.push([name, px, py, inks[layer]]);
       context.strokeStyle = inks[layer];
-      context.globalAlpha = hip ? 1 : 0.75;
+      context.globalAlpha = used ? 1 : 0.75;
       context.beginPath();
-      if (hip) context.arc(px, py, size, 0, 2 * Math.PI);
+      if (used) context.arc(px, py, size, 0, 2 * Math.PI);
       else context.rect(px - half, py - half, 2 * half, 2 * half);
       context.stroke();
     });
@@ -327,35 +388,35 @@ export class Sky {
     }
   }
 
+  // Everything that can be pointed at: place in the image, and what it is.
+  describe(head) {
+    const names = this.store.hello.star_names;
+    const magnitudes = new Map((head.catalogue || []).map((star) => [star[0], star[3]]));
+    const found = (head.detections || []).map(([x, y, magnitude, snr], number) => {
+      const hip = head.hips[number] || head.unused[number];
+      const measured = `measured ${fixed(magnitude, 2)} mag, SNR ${fixed(snr, 0)}\nx ${fixed(x, 2)}  y ${fixed(y, 2)}`;
+      if (!hip) return [x, y, `not identified\n${measured}`];
+      const use = head.hips[number] ? "" : "identified, left out of the fit\n";
+      return [x, y, `${names[hip] ? names[hip] + "  " : ""}HIP ${hip}  V ${fixed(magnitudes.get(hip), 2)}\n${use}${measured}`];
+    });
+    for (const star of missing(head)) found.push([star[1], star[2], `expected but not seen: ${names[star[0]] || ""} HIP ${star[0]}  V ${fixed(star[3], 2)}`]);
+    for (const [x, y] of head.false_stars || []) found.push([x, y, "false star"]);
+    return found;
+  }
+
   // Describe the object under the pointer.
   point() {
     if (!this.pointer || !this.shown) return;
-    const { head } = this.shown;
-    const names = this.store.hello.star_names;
     let best = HOVER_PX;
     let text = "";
-    const near = (x, y, say) => {
+    for (const [x, y, what] of this.stars) {
       const [px, py] = this.place(x, y);
       const distance = Math.hypot(px - this.pointer[0], py - this.pointer[1]);
       if (distance < best) {
         best = distance;
-        text = say();
+        text = what;
       }
-    };
-    const magnitudes = new Map((head.catalogue || []).map((star) => [star[0], star[3]]));
-    (head.detections || []).forEach(([x, y, magnitude, snr], number) => {
-      const hip = head.hips[number] || head.unused[number];
-      near(x, y, () => {
-        const measured = `measured ${fixed(magnitude, 2)} mag, SNR ${fixed(snr, 0)}\nx ${fixed(x, 2)}  y ${fixed(y, 2)}`;
-        if (!hip) return `not identified\n${measured}`;
-        const use = head.hips[number] ? "" : "detected, not used for the attitude\n";
-        return `${names[hip] ? names[hip] + "  " : ""}HIP ${hip}  V ${fixed(magnitudes.get(hip), 2)}\n${use}${measured}`;
-      });
-    });
-    for (const star of missing(head)) {
-      near(star[1], star[2], () => `missing: ${names[star[0]] || ""} HIP ${star[0]}  V ${fixed(star[3], 2)}`);
     }
-    for (const [x, y] of head.false_stars || []) near(x, y, () => "false star");
     this.hover.hidden = !text;
     if (!text) return;
     this.hover.textContent = text;

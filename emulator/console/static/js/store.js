@@ -5,56 +5,66 @@ const SPARSE_S = 5; // … and one in five seconds of the last hour
 const KEPT_S = 3600;
 const OVERDUE_S = 10; // age at which the newest frame is of the past
 
-// Rows of numbers by column, in arrays with the latest rows at the end.
+const TIMES = 2; // columns in double precision, which come first
+
+// Rows of numbers by column, in rings; `start` to before `end` are the numbers of the rows. Rows may come in any order: those that
+// are missing have the time of the row before and no other numbers.
 class Rows {
   constructor(columns, kept) {
     this.kept = kept;
     this.index = Object.fromEntries(columns.map((name, number) => [name, number]));
-    this.width = columns.length;
-    this.data = columns.map(() => new Float64Array(2 * kept));
+    this.data = columns.map((_, number) => (number < TIMES ? new Float64Array(kept) : new Float32Array(kept)));
     this.start = 0;
     this.end = 0;
   }
 
-  push(row) {
-    if (this.end === 2 * this.kept) {
-      for (const column of this.data) column.copyWithin(0, this.kept, 2 * this.kept);
-      this.end = this.kept;
-      this.start = 0;
+  // Take rows from a block: the times of all rows, then their other columns. Returns where the block ends.
+  read(buffer, offset, first, count) {
+    const others = this.data.length - TIMES;
+    const middle = offset + 8 * TIMES * count;
+    const end = middle + 4 * others * count;
+    if (!count) return end;
+    if (!this.length) this.start = this.end = first;
+    for (; this.end < first; this.end++) this.miss(this.end);
+    const times = new Float64Array(buffer.slice(offset, middle));
+    const numbers = new Float32Array(buffer.slice(middle, end));
+    for (let row = 0; row < count; row++) {
+      const at = (first + row) % this.kept;
+      for (let column = 0; column < TIMES; column++) this.data[column][at] = times[row * TIMES + column];
+      for (let column = 0; column < others; column++) this.data[TIMES + column][at] = numbers[row * others + column];
     }
-    for (let number = 0; number < this.width; number++) {
-      const item = row[number];
-      this.data[number][this.end] = item === null ? NaN : item;
-    }
-    this.end += 1;
-    if (this.end - this.start > this.kept) this.start += 1;
+    this.start = Math.min(this.start, first);
+    this.end = Math.max(this.end, first + count);
+    this.start = Math.max(this.start, this.end - this.kept);
+    return end;
+  }
+
+  miss(number) {
+    const at = number % this.kept;
+    for (const column of this.data) column[at] = NaN;
+    this.data[0][at] = number > this.start ? this.data[0][(number - 1) % this.kept] : -Infinity;
   }
 
   get length() {
     return this.end - this.start;
   }
 
-  column(name) {
-    return this.data[this.index[name]];
+  at(number, name) {
+    return this.data[this.index[name]][number % this.kept];
   }
 
-  at(position, name) {
-    return this.data[this.index[name]][position];
+  // Whether a row is of a frame; the others are changes to a mode without frames, or missing.
+  isFrame(number) {
+    return !Number.isNaN(this.at(number, "frame"));
   }
 
-  // Whether a row is of a frame; the others are changes to a mode without frames.
-  isFrame(position) {
-    return !Number.isNaN(this.at(position, "frame"));
-  }
-
-  // Position of the last row at or before a time.
+  // Number of the last row at or before a time.
   find(time) {
-    const times = this.column("run_s");
     let low = this.start;
     let high = this.end;
     while (low < high) {
       const middle = (low + high) >> 1;
-      if (times[middle] <= time) low = middle + 1;
+      if (this.at(middle, "run_s") <= time) low = middle + 1;
       else high = middle;
     }
     return Math.max(low - 1, this.start);
@@ -67,6 +77,8 @@ export class Store {
     this.rows = null;
     this.reasons = [];
     this.images = []; // {time, head, blob}, oldest first
+    this.events = []; // oldest first
+    this.samples = new Map(); // by telemetry row: [time, values], oldest first
     this.status = null;
     this.truth = null;
     this.stepping = 0;
@@ -86,12 +98,8 @@ export class Store {
   message(message) {
     switch (message.type) {
       case "hello":
-        if (this.cursor !== null) this.scrub(null);
-        this.status = null;
-        this.hello = message;
-        this.rows = new Rows(message.columns, message.kept_rows);
-        this.images = [];
-        break;
+        this.begin(message);
+        return;
       case "reasons":
         this.reasons = message.reasons;
         break;
@@ -100,37 +108,69 @@ export class Store {
         this.truth = message.truth;
         this.stepping = message.stepping; // speed of a stepped clock; 0: it is stopped
         break;
-      case "row":
-        this.add(message.row);
+      case "events":
+        this.addEvents(message.items);
+        break;
+      case "telemetry":
+        this.addSamples(message);
         break;
     }
     this.emit(message.type, message);
   }
 
-  history(numbers) {
-    const width = this.hello.columns.length;
-    for (let start = 0; start + width <= numbers.length; start += width) {
-      this.rows.push(numbers.subarray(start, start + width));
+  // The description of a run. After a reconnection to the same run everything is kept.
+  begin(hello) {
+    const same = this.hello !== null && this.hello.run_id === hello.run_id && this.hello.head === hello.head;
+    this.hello = hello;
+    if (!same) {
+      if (this.cursor !== null) this.scrub(null);
+      this.status = null;
+      this.rows = new Rows(hello.columns, hello.kept_rows);
+      this.images = [];
+      this.events = [];
+      this.samples.clear();
+      this.emit("hello", hello);
     }
-    this.emit("rows");
-    this.emit("shown");
+    this.emit("connected", hello);
+    if (!same) this.emit("shown");
   }
 
-  // A new page is sent the latest image, whose row is already in the history.
-  frame(head, blob) {
-    if (!this.rows) return;
+  // Numbers of the next row and the next event that the page lacks.
+  known() {
+    return { history: this.rows ? this.rows.end : 0, events: this.events.length ? this.events.at(-1).n + 1 : 0 };
+  }
+
+  read(buffer, offset, first, count) {
+    const end = this.rows.read(buffer, offset, first, count);
+    if (count) {
+      this.emit("rows");
+      if (this.cursor === null) this.emit("shown");
+    }
+    return end;
+  }
+
+  // A new page is sent the latest image, whose row may come later.
+  addImage(head, blob) {
     const time = head.row[this.rows.index.run_s];
-    if (blob && !(this.images.length && time <= this.images.at(-1).time)) {
-      this.images.push({ time, head, blob });
-      this.thin(time);
-    }
-    this.add(head.row);
+    if (this.images.length && time <= this.images.at(-1).time) return;
+    this.images.push({ time, head, blob });
+    this.thin(time);
+    if (this.cursor === null) this.emit("shown");
   }
 
-  add(row) {
-    if (!this.rows.length || row[this.rows.index.run_s] > this.now) this.rows.push(row);
-    this.emit("rows");
-    if (this.cursor === null) this.emit("shown");
+  addEvents(items) {
+    const known = new Set(this.events.map((event) => event.n));
+    this.events.push(...items.filter((event) => !known.has(event.n)));
+    this.events.sort((a, b) => a.n - b.n);
+  }
+
+  // Values of telemetry fields, by row: the times, and the values by field.
+  addSamples({ row, values, outcome }) {
+    if (outcome !== "ok" || !this.status) return;
+    if (!this.samples.has(row)) this.samples.set(row, []);
+    const samples = this.samples.get(row);
+    samples.push([this.time, values]);
+    if (samples.length > KEPT_S) samples.shift();
   }
 
   thin(now) {

@@ -1,7 +1,7 @@
-// A form for each telecommand, with a preview of its bytes, and the reply.
+// A form for each telecommand, with a preview of its bytes, and what was sent.
 
 import { address } from "./link.js";
-import { limits, make, setText, short, wall } from "./format.js";
+import { ask, limits, make, number, prose, say, setText, short, wall } from "./format.js";
 
 const KEPT_LINES = 200;
 
@@ -12,27 +12,44 @@ export class Telecommands {
     this.host = document.getElementById("telecommands");
     this.chosen = null;
     store.on("hello", (hello) => this.build(hello));
-    store.on("sent", (item) => this.note(item));
+    store.on("sent", (message) => this.note(message));
     store.on("status", (message) => this.count(message.session_steps));
   }
 
   build(hello) {
     this.rows = new Map(hello.telecommands.map((row) => [row.name, row]));
     this.parameters = hello.parameters;
-    this.select = make("select", { id: "telecommand", size: "7", "aria-label": "telecommand", onchange: () => this.choose(this.select.value) });
-    for (const row of hello.telecommands) this.select.append(make("option", { value: row.name, text: `${String(row.id).padStart(3, "\u2007")}  ${row.name}` }));
+    this.filter = make("input", { type: "search", placeholder: "filter telecommands", "aria-label": "filter telecommands", oninput: () => this.list() });
+    this.select = make("select", { id: "telecommand", size: "8", "aria-label": "telecommand", onchange: () => this.choose(this.select.value) });
     this.form = make("form", { id: "telecommand-form", onsubmit: (event) => this.send(event) });
-    this.log = this.log || make("ol", { class: "log scroll", id: "sent" });
-    this.steps = make("output", { class: "num dim", text: "0 sent" });
+    this.form.addEventListener("keydown", (event) => {
+      if (event.ctrlKey && event.key === "Enter") this.form.requestSubmit();
+    });
+    this.log = make("ol", { class: "log scroll", id: "sent", tabindex: "0", "aria-label": "sent" });
+    this.steps = make("span", { class: "num dim", text: "0 sent" });
     const save = make("a", { class: "button", id: "save-session", href: address("/session.toml"), download: "session.toml", title: "what this console has sent, for `starhil session`", text: "save as session" });
-    const clear = make("button", { type: "button", id: "clear-session", text: "clear", onclick: () => this.clear() });
-    this.host.replaceChildren(this.select, make("fieldset", { class: "commands" }, this.form), make("div", { class: "bar" }, make("h2", { text: "Sent" }), this.steps, make("span", { class: "spacer" }), save, clear), this.log);
+    const clear = make("button", { type: "button", id: "clear-session", text: "clear", onclick: () => this.link.request({ do: "clear_session" }) });
+    this.host.replaceChildren(
+      make("div", { class: "bar" }, this.filter), this.select, make("fieldset", { class: "commands" }, this.form),
+      make("div", { class: "bar" }, make("h2", { text: "Sent" }), this.steps, make("span", { class: "spacer" }), save, clear), this.log);
+    this.list();
     if (this.rows.has(this.chosen)) this.choose(this.chosen);
     else this.form.replaceChildren(make("p", { class: "dim doc", text: "Choose a telecommand." }));
   }
 
-  choose(name) {
+  list() {
+    const wanted = this.filter.value.trim().toLowerCase();
+    const rows = [...this.rows.values()].filter((row) => `${row.id} ${row.name} ${row.doc}`.toLowerCase().includes(wanted));
+    this.select.replaceChildren(...rows.map((row) => make("option", { value: row.name, text: `${String(row.id).padStart(3, "\u2007")}  ${row.name}`, selected: row.name === this.chosen })));
+  }
+
+  // Show the form of a telecommand, with values of it.
+  choose(name, values = {}) {
     this.chosen = name;
+    if (![...this.select.options].some((option) => option.value === name)) {
+      this.filter.value = "";
+      this.list();
+    }
     this.select.value = name;
     const row = this.rows.get(name);
     const fields = row.fields.map((field) => {
@@ -41,23 +58,37 @@ export class Telecommands {
       return make("label", { class: "field", title: field.doc }, make("span", { text: field.name }), control, note);
     });
     this.problem = make("p", { class: "problem" });
-    this.bytes = make("pre", { class: "bytes", id: "bytes" });
-    const send = make("button", { type: "submit", class: "primary", id: "send", title: "Ctrl+Enter", text: `send ${name}` });
-    this.form.replaceChildren(make("p", { class: "dim doc", text: row.doc }), ...fields, this.bytes, this.problem, send);
-    this.form.oninput = () => this.preview();
-    this.form.onchange = () => this.showParameter();
+    this.bytes = make("pre", { class: "bytes", id: "bytes", tabindex: "0", role: "group", "aria-label": "bytes" });
+    const send = make("button", { type: "submit", class: "primary", id: "send", title: `send ${name} (Ctrl+Enter in this form)`, text: `Send ${name}` });
+    this.form.replaceChildren(make("p", { class: "dim doc" }, ...prose(row.doc)), ...fields, this.bytes, this.problem, send);
+    for (const [key, item] of Object.entries(values)) if (this.form.elements[key]) this.form.elements[key].value = String(item);
+    this.form.oninput = (event) => {
+      if (event.target.name === "value") event.target.dataset.edited = "yes";
+      this.preview();
+    };
+    this.form.onchange = (event) => {
+      if (event.target.dataset.parameters) delete this.form.elements.value.dataset.edited;
+      this.showParameter();
+    };
+    if ("value" in values) this.form.elements.value.dataset.edited = "yes";
     this.preview();
     this.showParameter();
   }
 
-  // Beside a value for a parameter: its unit, limits and present value.
+  // Beside a value for a parameter: its unit, limits and present value, with which the field begins.
   async showParameter() {
     const [select, note] = ["[data-parameters]", "[data-note=value]"].map((selector) => this.form.querySelector(selector));
+    this.limits = null;
     if (!select || !note) return;
     const { values } = await this.link.request({ do: "parameters" });
-    const { name, unit, min, max } = this.parameters.find((item) => String(item.id) === select.value);
+    const parameter = this.parameters.find((item) => String(item.id) === select.value);
+    const { name, unit, min, max } = parameter;
+    this.limits = parameter;
+    const field = this.form.elements.value;
+    if (values && field && !field.dataset.edited) field.value = String(values[name]);
     const present = values ? [short(values[name]), unit].filter(Boolean).join(" ") : "–";
     setText(note, `now ${present}\n${short(min)} … ${short(max)}`);
+    this.preview();
   }
 
   control(field) {
@@ -67,7 +98,7 @@ export class Telecommands {
     if (field.parameters) {
       return make("select", { name, "data-parameters": true }, ...this.parameters.map((item) => make("option", { value: String(item.id), text: `${item.id} ${item.name}` })));
     }
-    const initial = field.default ?? (field.kind === "bytes" ? "00".repeat(field.bytes) : field.kind === "text" ? "" : Math.max(0, field.min ?? 0));
+    const initial = field.default ?? (field.kind === "bytes" ? "00".repeat(field.bytes) : field.kind === "text" ? "" : Math.max(0, Number(field.min ?? 0)));
     return make("input", { name, value: String(initial), autocomplete: "off", spellcheck: "false", inputmode: field.kind === "text" || field.kind === "bytes" ? "text" : "decimal" });
   }
 
@@ -77,17 +108,24 @@ export class Telecommands {
 
   async preview() {
     const name = this.chosen;
-    const answer = await this.link.request({ do: "encode", row: name, values: this.values() });
+    const values = this.values();
+    const answer = await this.link.request({ do: "encode", row: name, values });
     if (name !== this.chosen) return;
     if (!answer.ok) {
       setText(this.problem, answer.error);
-      setText(this.bytes, "–");
+      setText(this.bytes, "");
       return;
     }
-    setText(this.problem, answer.problem ? `violates the definition, but can be sent: ${answer.problem}` : "");
+    const beyond = this.limits && values.value !== undefined ? number(values.value, this.limits.min, this.limits.max).problem : "";
+    const problem = answer.problem || (beyond && `${this.limits.name}: ${beyond}`);
+    setText(this.problem, problem ? `violates the definition, but can be sent: ${problem}` : "");
     const lines = [];
     if (answer.serial) lines.push(`serial   ${answer.serial}`);
-    for (const frame of answer.cansend || []) lines.push(`cansend ${this.interface()} ${frame}`);
+    for (const [who, frames] of [["as this console", answer.cansend], [`as OBC ${answer.obc_address}`, answer.as_obc]]) {
+      if (!frames || !frames.length) continue;
+      if (answer.as_obc.length) lines.push(`${who}:`);
+      for (const frame of frames) lines.push(`cansend ${this.interface()} ${frame}`);
+    }
     setText(this.bytes, lines.join("\n"));
   }
 
@@ -98,23 +136,41 @@ export class Telecommands {
 
   async send(event) {
     event.preventDefault();
-    const row = this.chosen;
-    const values = this.values();
-    const answer = await this.link.request({ do: "send", row, values });
-    this.store.emit("sent", { row, values, kind: "command", ...answer });
+    await this.transmit(this.chosen, this.values());
     this.showParameter();
   }
 
-  submit() {
-    if (this.chosen) this.form.requestSubmit();
+  // Send a telecommand, after a question if it interrupts the device or deletes something.
+  async transmit(row, values) {
+    if (this.rows.get(row).confirm && await ask(`${row} interrupts the unit or deletes something. Send it?`, `Send ${row}`) === "") return;
+    const answer = await this.link.request({ do: "send", row, values });
+    if (answer.ok) return;
+    this.add({ kind: "telecommand", row, values, wall_s: Date.now() / 1000, outcome: "not_sent", detail: answer.error, refused: false });
+    say(`${row}: ${answer.error}`);
   }
 
-  note(item) {
-    const outcome = item.ok ? item.outcome : "not sent";
-    const good = item.ok && item.outcome === "ok";
-    const pairs = Object.entries(item.values && item.kind === "command" ? item.values : {}).map(([key, one]) => `${key}=${one}`).join(" ");
-    const text = good ? `${item.kind === "command" ? "accepted" : "read"} in ${item.latency_ms.toFixed(1)} ms` : item.ok ? (item.refused ? `refused: ${outcome}` : item.detail) : item.error;
-    const line = make("li", { class: good ? "good" : "bad" }, make("time", { class: "num dim", text: wall(Date.now() / 1000).slice(0, 8) }), make("b", { text: item.row }), make("span", { class: "num", text: pairs }), make("span", { class: "outcome", text }));
+  // What this console, on any page, has sent.
+  note(message) {
+    if (!this.log) return;
+    if (message.all) this.log.replaceChildren();
+    for (const item of message.items) this.add(item);
+    const last = message.items.at(-1);
+    if (last && !message.all) {
+      this.link.noteReply(this.store.time, last);
+      say(`${last.row} ${outcome(last)}`);
+    }
+  }
+
+  add(item) {
+    const command = item.kind === "telecommand";
+    const pairs = command ? Object.entries(item.values).map(([key, one]) => `${key}=${one}`).join(" ") : "";
+    const again = command && this.rows.has(item.row) ? [
+      make("button", { type: "button", class: "small", text: "again", "aria-label": `send ${item.row} again`, onclick: () => this.transmit(item.row, item.values) }),
+      make("button", { type: "button", class: "small", text: "edit", "aria-label": `edit ${item.row}`, onclick: () => this.choose(item.row, item.values) }),
+    ] : [];
+    const line = make("li", { class: item.outcome === "ok" ? "good" : "bad" },
+      make("time", { class: "num dim", text: wall(item.wall_s).slice(0, 8) }), make("b", { text: item.row }), make("span", { class: "num pairs", text: pairs }),
+      make("span", { class: "outcome", text: outcome(item) }), make("fieldset", { class: "commands" }, ...again));
     this.log.prepend(line);
     while (this.log.children.length > KEPT_LINES) this.log.lastChild.remove();
   }
@@ -122,10 +178,9 @@ export class Telecommands {
   count(steps) {
     if (this.steps) setText(this.steps, `${steps} sent`);
   }
+}
 
-  async clear() {
-    await this.link.request({ do: "clear_session" });
-    this.log.replaceChildren();
-    this.count(0);
-  }
+function outcome({ kind, outcome: name, detail, refused, latency_ms: taken }) {
+  if (name === "ok") return `${kind === "telecommand" ? "accepted" : "read"} in ${taken.toFixed(1)} ms`;
+  return refused ? `refused: ${name}` : detail;
 }

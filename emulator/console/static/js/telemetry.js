@@ -1,19 +1,23 @@
-// All telemetry rows, decoded live; only visible rows are read.
+// All telemetry rows, decoded live; only rows that are visible or plotted are read.
 
 import { limits, make, setText, value, wall } from "./format.js";
 
 const STALE_MS = 5000;
 
 export class Telemetry {
-  constructor(store, link) {
+  constructor(store, link, charts) {
     this.store = store;
     this.link = link;
+    this.charts = charts;
     this.host = document.getElementById("telemetry");
     this.blocks = new Map();
     this.seen = new Set();
     this.active = false;
+    this.text = "";
     store.on("hello", (hello) => this.build(hello));
     store.on("telemetry", (message) => this.update(message));
+    store.on("plotted", () => this.subscribe());
+    store.on("cursor", () => this.subscribe());
     setInterval(() => this.age(), 1000);
   }
 
@@ -21,8 +25,8 @@ export class Telemetry {
     if (this.observer) this.observer.disconnect();
     this.blocks.clear();
     this.seen.clear();
-    const filter = make("input", { type: "search", placeholder: "filter rows and fields", "aria-label": "filter", oninput: () => this.filter(filter.value) });
-    const scroll = make("div", { class: "scroll" });
+    const filter = make("input", { type: "search", placeholder: "filter rows and fields", "aria-label": "filter rows and fields", value: this.text, oninput: () => this.filter(filter.value) });
+    const scroll = make("div", { class: "scroll", tabindex: "0", role: "group", "aria-label": "telemetry rows" });
     this.observer = new IntersectionObserver((entries) => {
       for (const entry of entries) {
         if (entry.isIntersecting) this.seen.add(entry.target.dataset.row);
@@ -37,22 +41,27 @@ export class Telemetry {
       this.observer.observe(block.element);
     }
     this.host.replaceChildren(make("div", { class: "bar" }, filter), scroll);
+    this.filter(this.text);
   }
 
   block(row) {
-    const when = make("output", { class: "num dim" });
+    const when = make("span", { class: "num dim when" });
     const fields = new Map();
-    const table = make("table");
+    const table = make("table", { id: `row-${row.name}` });
     for (const field of row.fields) {
       const cell = make("td", { class: "num val", text: "–" });
       fields.set(field.name, { cell, field });
-      table.append(make("tr", { title: field.doc }, make("th", { text: field.name }), cell, make("td", { class: "unit dim", text: field.unit }), make("td", { class: "num dim lim", text: limits(field) })));
+      table.append(make("tr", { title: field.doc }, make("th", { scope: "row", text: field.name }), cell, make("td", { class: "unit dim", text: field.unit }), make("td", { class: "num dim lim", text: limits(field) })));
     }
-    const read = make("button", { type: "button", text: "read", title: "read once, as a step of the session", onclick: () => this.read(row.name) });
-    const head = make("summary", { title: row.doc }, make("span", { class: "num dim", text: String(row.id) }), make("b", { text: row.name }), make("span", { class: "spacer" }), when, read);
-    const element = make("details", { class: "row", "data-row": row.name, open: true }, head, table);
-    element.addEventListener("toggle", () => this.subscribe());
-    return { element, when, fields, at: 0, row };
+    const fold = make("button", { type: "button", class: "fold", "aria-expanded": "true", "aria-controls": table.id, title: row.doc }, make("span", { class: "num dim", text: String(row.id) }), make("b", { text: row.name }));
+    const read = make("button", { type: "button", class: "read", text: "read", "aria-label": `read ${row.name}`, title: "read once, as a step of the session", onclick: () => this.link.request({ do: "read", row: row.name }).then((answer) => answer.ok && this.update({ row: row.name, ...answer })) });
+    const element = make("section", { class: "row", "data-row": row.name, "aria-label": row.name }, make("div", { class: "row-head" }, fold, make("span", { class: "spacer" }), when, read), table);
+    fold.addEventListener("click", () => {
+      table.hidden = !table.hidden;
+      fold.setAttribute("aria-expanded", String(!table.hidden));
+      this.subscribe();
+    });
+    return { element, when, fields, at: 0, row, table };
   }
 
   show(active) {
@@ -60,21 +69,17 @@ export class Telemetry {
     this.subscribe();
   }
 
+  // While the page is paused, nothing is read.
   subscribe() {
-    const rows = this.active ? [...this.seen].filter((name) => this.blocks.get(name).element.open) : [];
-    if (rows.join() === this.link.wanted.rows.join()) return;
-    this.link.subscribe({ rows });
-  }
-
-  async read(name) {
-    const answer = await this.link.request({ do: "read", row: name });
-    this.store.emit("sent", { row: name, kind: "read", ...answer });
-    if (answer.ok) this.update({ row: name, ...answer });
+    const visible = this.active && this.store.cursor === null ? [...this.seen].filter((name) => !this.blocks.get(name).table.hidden) : [];
+    const rows = [...new Set([...visible, ...this.charts.rows])];
+    if (rows.join() !== this.link.wanted.rows.join()) this.link.subscribe({ rows });
   }
 
   update(message) {
     const block = this.blocks.get(message.row);
-    if (!block) return;
+    this.link.noteReply(this.store.time, message);
+    if (!block || this.store.cursor !== null) return;
     block.at = performance.now();
     const failed = message.outcome !== "ok";
     block.element.classList.toggle("bad", failed);
@@ -83,7 +88,7 @@ export class Telemetry {
     for (const [name, item] of Object.entries(message.values || {})) {
       const { cell, field } = block.fields.get(name);
       setText(cell, value(item, field));
-      const outside = typeof item === "number" && field.min !== undefined && (item < field.min || item > field.max);
+      const outside = typeof item === "number" && field.min !== undefined && (item < Number(field.min) || item > Number(field.max));
       cell.classList.toggle("outside", outside);
     }
   }
@@ -94,6 +99,7 @@ export class Telemetry {
   }
 
   filter(text) {
+    this.text = text;
     const wanted = text.trim().toLowerCase();
     for (const { element, row } of this.blocks.values()) {
       const found = !wanted || row.name.includes(wanted) || row.fields.some((field) => field.name.includes(wanted));

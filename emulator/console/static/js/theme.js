@@ -9,7 +9,7 @@ export function initTheme(button) {
   button.addEventListener("click", toggleTheme);
 }
 
-export function toggleTheme() {
+function toggleTheme() {
   const next = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
   document.documentElement.dataset.theme = next;
   localStorage.setItem("starhil-theme", next);

@@ -1,10 +1,11 @@
-// The trace of serial line and CAN bus, decoded, with filters.
+// The traffic of all links, decoded, with filters; a message opens on a click.
 
 import { address } from "./link.js";
-import { fixed, make, press, setText, wall } from "./format.js";
+import { fixed, make, press, say, setText, value, wall } from "./format.js";
 
 const KEPT_LINES = 1000;
 const SHOWN_LINES = 400;
+const HUES = 6;
 const KINDS = [["requests", ["telecommand", "telemetry"]], ["replies", ["ack", "reply"]], ["refusals, faults", ["nack", "fault"]], ["parts", ["part"]], ["CANopen", ["canopen"]]];
 
 export class Wire {
@@ -22,10 +23,11 @@ export class Wire {
     this.build();
     store.on("hello", (hello) => this.begin(hello));
     store.on("wire", (message) => this.add(message));
+    store.on("cursor", () => this.render());
   }
 
   check(label, on, change) {
-    const box = make("input", { type: "checkbox", onchange: () => { change(box.checked); this.render(); } });
+    const box = make("input", { type: "checkbox", onchange: () => { change(box.checked); this.render(true); } });
     box.checked = on;
     return make("label", { class: "check" }, box, label);
   }
@@ -33,19 +35,28 @@ export class Wire {
   begin(hello) {
     this.lines = [];
     this.titles = hello.buses;
-    this.buses.replaceChildren(...Object.entries(this.titles).map(([bus, title]) => this.check(title, !this.hiddenBuses.has(bus), (on) => (on ? this.hiddenBuses.delete(bus) : this.hiddenBuses.add(bus)))));
+    this.buses.replaceChildren(...Object.entries(this.titles).filter(([bus]) => bus !== "console").map(([bus, title]) => this.check(title, !this.hiddenBuses.has(bus), (on) => (on ? this.hiddenBuses.delete(bus) : this.hiddenBuses.add(bus)))));
+    this.candump.hidden = !("can" in hello.links);
+    this.render(true);
   }
 
   build() {
-    const filter = make("input", { type: "search", placeholder: "filter: name, hex, address", "aria-label": "filter", oninput: () => { this.text = filter.value.trim().toLowerCase(); this.render(); } });
-    this.hold = make("button", { type: "button", text: "hold", onclick: () => this.setHeld(!this.held) });
+    const filter = make("input", { type: "search", placeholder: "filter: name, hex, address", "aria-label": "filter messages", oninput: () => { this.text = filter.value.trim().toLowerCase(); this.render(true); } });
+    this.hold = make("button", { type: "button", "aria-pressed": "false", text: "hold", onclick: () => this.setHeld(!this.held) });
     this.buses = make("span", { class: "bar wrap" });
     const kinds = KINDS.map(([label, names]) => this.check(label, !this.hidden.has(names[0]), (on) => { for (const name of names) on ? this.hidden.delete(name) : this.hidden.add(name); }));
     kinds.push(this.check("console", this.own, (on) => (this.own = on)));
-    this.left = make("output", { class: "num dim" });
-    const save = make("a", { class: "button", href: address("/wire.log"), download: "wire.log", text: "candump log" });
-    this.list = make("ol", { class: "trace scroll" });
-    this.host.append(make("div", { class: "bar wrap" }, filter, this.hold, save, this.left), make("div", { class: "bar wrap" }, this.buses, ...kinds), this.list);
+    this.left = make("span", { class: "num dim" });
+    const file = (path, name, text) => make("a", { class: "button", href: address(path), download: name, text });
+    this.candump = file("/wire.log", "wire.log", "candump log");
+    const files = [file("/wire.txt", "wire.txt", "text"), this.candump, file("/wire.pcapng", "wire.pcapng", "pcapng"), file("/record.mcap", "record.mcap", "MCAP")];
+    this.detail = make("div", { class: "message", hidden: true });
+    this.list = make("ol", { class: "trace scroll", tabindex: "0", "aria-label": "messages, newest first" });
+    this.list.addEventListener("click", (event) => {
+      const line = event.target.closest("li");
+      if (line && event.target.closest("button")) this.open(Number(line.dataset.n));
+    });
+    this.host.append(make("div", { class: "bar" }, filter, this.hold, this.left), make("div", { class: "bar wrap" }, make("span", { class: "dim", text: "save:" }), ...files), make("div", { class: "bar wrap" }, this.buses, ...kinds), this.detail, this.list);
   }
 
   show(active) {
@@ -56,16 +67,15 @@ export class Wire {
   setHeld(held) {
     this.held = held;
     press(this.hold, held);
-    if (!held) this.render();
+    this.render();
   }
 
   add(message) {
-    const last = this.lines.length ? this.lines[this.lines.length - 1].n : -1;
-    this.lines.push(...message.lines.filter((line) => line.n > last));
+    const last = this.lines.length ? this.lines.at(-1).n : -1;
+    this.lines.push(...message.items.filter((line) => line.n > last));
     if (this.lines.length > KEPT_LINES) this.lines.splice(0, this.lines.length - KEPT_LINES);
-    if (message.left_out) this.left.textContent = `${message.left_out} left out`;
-    else this.left.textContent = "";
-    if (!this.held) this.render();
+    setText(this.left, message.left_out ? `${message.left_out} left out` : "");
+    this.render();
   }
 
   wanted(line) {
@@ -73,27 +83,64 @@ export class Wire {
     return !this.text || `${line.raw} ${line.text}`.toLowerCase().includes(this.text);
   }
 
-  // Newest first; lines that are already on the screen are kept.
-  render() {
-    const shown = this.lines.filter((line) => this.wanted(line)).slice(-SHOWN_LINES).reverse();
-    const there = new Map([...this.list.children].map((item) => [item.dataset.n, item]));
-    this.list.replaceChildren(...shown.map((line, number) => {
-      const item = there.get(String(line.n)) || this.item(line);
-      const before = shown[number + 1];
-      setText(item.querySelector(".since"), before ? `+${fixed(line.t - before.t, 3)}` : "");
+  // Newest first; only what is new is put on the screen, unless the filter has changed.
+  render(again = false) {
+    if (!again && (this.held || this.store.cursor !== null)) return;
+    if (again) this.list.replaceChildren();
+    const newest = this.list.firstElementChild ? Number(this.list.firstElementChild.dataset.n) : -1;
+    const fresh = this.lines.filter((line) => line.n > newest && this.wanted(line)).slice(-SHOWN_LINES);
+    let before = this.list.firstElementChild ? Number(this.list.firstElementChild.dataset.t) : null;
+    const items = fresh.map((line) => {
+      const item = this.item(line, before);
+      before = line.t;
       return item;
-    }));
+    });
+    this.list.prepend(...items.reverse());
+    while (this.list.children.length > SHOWN_LINES) this.list.lastElementChild.remove();
   }
 
-  item(line) {
+  item(line, before) {
     return make(
       "li",
-      { class: line.kind, "data-n": String(line.n) },
+      { class: line.kind, "data-n": String(line.n), "data-t": String(line.t) },
       make("time", { class: "num dim", text: wall(line.t) }),
-      make("span", { class: "num dim since", title: "seconds since the line below" }),
-      make("span", { class: "way", text: `${this.titles[line.bus].slice(0, 3)} ${line.out ? "◀" : "▶"}`, title: line.out ? "from the device" : "to the device, or between others" }),
-      make("span", { class: "text", text: line.text, title: line.text }),
+      make("span", { class: "num dim since", title: "seconds since the line below", text: before === null ? "" : `+${fixed(line.t - before, 3)}` }),
+      make("span", { class: "way", text: `${line.own ? "own" : this.titles[line.bus].slice(0, 3)} ${line.out ? "◀" : "▶"}`, title: line.out ? "from the device" : "to the device, or between others" }),
+      make("button", { type: "button", class: "text", text: line.text }),
       make("code", { text: line.raw }),
     );
+  }
+
+  // A message with all its bytes, coloured by field.
+  async open(n) {
+    const answer = await this.link.request({ do: "message", n });
+    const close = make("button", { type: "button", class: "small", text: "close", onclick: () => (this.detail.hidden = true) });
+    this.detail.hidden = false;
+    if (!answer.ok) {
+      this.detail.replaceChildren(make("p", { class: "problem", text: answer.error }), close);
+      return;
+    }
+    const copies = [["hex", (answer.data || answer.raw.join(" ")).replaceAll(" ", "")], ["cansend", answer.cansend.map((frame) => `cansend vcan0 ${frame}`).join("\n")], ["Python", answer.python]];
+    const buttons = copies.filter(([, text]) => text).map(([label, text]) => make("button", { type: "button", class: "small", text: `copy ${label}`, onclick: () => copy(text, label) }));
+    const bytes = (answer.data || "").split(" ").filter(Boolean);
+    const hue = new Map(answer.fields.map((field, number) => [field, number % HUES]));
+    const coloured = bytes.map((text, at) => {
+      const field = answer.fields.find((each) => each.start <= at && at < each.end);
+      return make("span", { class: field ? `hue-${hue.get(field)}` : "", title: field ? field.name : "", text: `${text} ` });
+    });
+    const fields = make("table", { class: "facts" }, ...answer.fields.map((field) => make("tr", {},
+      make("th", { scope: "row", class: `hue-${hue.get(field)}`, text: field.name }), make("td", { class: "num", text: `${value(field.value)} ${field.unit}` }), make("td", { class: "num dim", text: `bytes ${field.start} … ${field.end - 1}` }))));
+    this.detail.replaceChildren(
+      make("div", { class: "bar wrap" }, make("b", { text: answer.row || "message" }), make("span", { class: "spacer" }), ...buttons, close),
+      make("pre", { class: "bytes" }, ...(coloured.length ? coloured : [answer.raw.join("\n")])), fields);
+  }
+}
+
+async function copy(text, label) {
+  try {
+    await navigator.clipboard.writeText(text);
+    say(`${label} copied`);
+  } catch {
+    say("the browser does not let this page copy");
   }
 }

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.integrate import trapezoid
 
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.sensor.sky.light import AreaPainter
@@ -26,7 +27,7 @@ def sunlight_photons_s_m2() -> float:
     planck, light, boltzmann = 6.62607015e-34, 299_792_458.0, 1.380649e-23
     wave = np.linspace(400e-9, 900e-9, 2001)
     radiance = 2.0 * light / wave**4 / np.expm1(planck * light / (wave * boltzmann * 5772.0))
-    return math.pi * math.radians(959.63 / 3600.0) ** 2 * float(np.trapezoid(radiance, wave))
+    return math.pi * math.radians(959.63 / 3600.0) ** 2 * float(trapezoid(radiance, wave))
 
 
 def light(objects: SkyObjects, sensor: SensorModel = SENSOR, camera: Camera = CAMERA) -> np.ndarray:

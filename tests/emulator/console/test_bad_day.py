@@ -1,0 +1,376 @@
+"""The page on a bad day: slow links, hidden tabs, keys, faults, many messages; and its accessibility, judged by axe-core."""
+
+import time
+from urllib.parse import urlsplit
+
+import pytest
+
+from tests.emulator.console.browser import (
+    AXE,
+    MARKS,
+    WITHIN_MS,
+    ask,
+    chromium,
+    command,
+    emulator_with_console,
+    fault,
+    opened,
+    slow_link,
+    track,
+    wait_for_text,
+)
+
+pytestmark = MARKS
+
+SLOW_BYTES_S = 60_000
+"""Rate of a slow link: less than images at 3 Hz need."""
+
+SSH_BUFFER = 2_000_000
+"""What `ssh -L` holds on the way, bytes."""
+
+TABS = ("telemetry", "telecommands", "wire", "events", "faults", "truth")
+WIDTHS = (390, 820, 1280, 1920, 3840)
+
+
+@pytest.fixture(scope="module")
+def emulator():
+    with emulator_with_console(serial="auto", settings=["parameters.update_rate=3"]) as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def shared(browser, emulator):
+    with opened(browser, emulator.ready["view"]) as page:
+        track(page)
+        yield page
+
+
+@pytest.fixture
+def page(shared):
+    """The page of the module, live, at a desk, without faults."""
+    shared.set_viewport_size({"width": 1280, "height": 800})
+    shared.evaluate(
+        "starhil.store.scrub(null); document.activeElement.blur(); document.querySelectorAll('dialog[open]').forEach((each) => each.close())"
+    )
+    assert ask(shared, do="control", request={"do": "clear_faults"})["ok"]
+    track(shared)
+    return shared
+
+
+def open_tab(page, name):
+    page.click(f"[data-tab={name}]")
+
+
+def test_over_a_slow_link_that_buffers_the_newest_image_is_young_and_its_age_is_shown(
+    page, browser, emulator
+):
+    port = urlsplit(emulator.ready["view"]).port
+    with slow_link(port, SLOW_BYTES_S, SSH_BUFFER) as slow_port:
+        slow = browser.new_page()
+        slow.set_default_timeout(WITHIN_MS)
+        slow.goto(emulator.ready["view"].replace(str(port), str(slow_port)))
+        slow.wait_for_function("() => window.starhil && starhil.store.images.length > 2")
+        ages = []
+        for _ in range(16):
+            time.sleep(0.5)
+            ages.append(
+                page.evaluate("starhil.store.now") - slow.evaluate("starhil.store.images.at(-1).time")
+            )
+        shown = slow.locator("#when").text_content()
+        age = slow.evaluate("starhil.link.age")
+        rows = slow.evaluate("[starhil.store.rows.end, starhil.store.rows.length]")
+        slow.close()
+    assert sorted(ages)[len(ages) // 2] <= 2.0
+    assert max(ages) <= 4.0  # the machine of the tests is busy
+    assert rows[0] == rows[1]
+    assert age < 2.0
+    assert shown == "live" or shown.endswith((" s behind", " s ago"))
+
+
+def test_what_is_older_than_a_second_is_not_live(page):
+    page.wait_for_function("() => document.getElementById('when').textContent === 'live'")
+    page.evaluate(
+        "() => { window.held = []; starhil.link.socket.onmessage = (event) => held.push(event.data); }"
+    )
+    wait_for_text(page, "#link", "slow link")
+    assert page.locator("#when").text_content().endswith(" s behind")
+    page.evaluate(
+        "() => { starhil.link.socket.onmessage = (event) => starhil.link.receive(event.data); for (const data of held) starhil.link.receive(data); }"
+    )
+    wait_for_text(page, "#link", "connected")
+
+
+def test_what_a_hidden_page_missed_is_filled_when_it_is_shown(page):
+    hide = "hidden => { Object.defineProperty(document, 'hidden', { value: hidden, configurable: true }); document.dispatchEvent(new Event('visibilitychange')); }"
+    page.evaluate(hide, arg=True)
+    begin = page.evaluate("starhil.store.rows.end")
+    time.sleep(2.5)
+    assert page.evaluate("starhil.store.rows.end") <= begin + 3
+    page.evaluate(hide, arg=False)
+    page.wait_for_function("begin => starhil.store.rows.end >= begin + 6", arg=begin)
+    missing = page.evaluate(
+        "begin => { const { rows } = starhil.store; let count = 0; for (let at = begin; at < rows.end; at++) count += Number.isNaN(rows.at(at, 'mode')); return count; }",
+        begin,
+    )
+    assert missing == 0
+    numbers = page.evaluate(
+        "begin => { const { rows } = starhil.store; return Array.from({ length: rows.end - begin }, (_, at) => rows.at(begin + at, 'frame')); }",
+        begin,
+    )
+    assert numbers == list(range(int(numbers[0]), int(numbers[0]) + len(numbers)))
+
+
+def test_letters_and_ctrl_enter_act_only_in_their_part(page):
+    open_tab(page, "telecommands")
+    page.select_option("#telecommand", "set_mode")
+    sent = page.locator("#sent li").count()
+    page.focus("#plots")
+    for key in ("Control+Enter", "c", "x", "1", "t", "r"):
+        page.keyboard.press(key)
+    time.sleep(0.5)
+    assert page.locator("#sent li").count() == sent
+    assert page.locator("#active").text_content() == "no fault"
+    assert page.get_attribute("[data-layer=matched]", "aria-pressed") == "true"
+    page.focus(".stage")
+    page.keyboard.press("1")
+    assert page.get_attribute("[data-layer=matched]", "aria-pressed") == "false"
+    page.keyboard.press("1")
+    page.focus("#telecommand-form [name=mode]")
+    page.keyboard.press("Control+Enter")
+    page.wait_for_function("count => document.querySelectorAll('#sent li').length > count", arg=sent)
+
+
+def test_a_telecommand_that_restarts_or_deletes_asks_first(page):
+    open_tab(page, "telecommands")
+    for row in ("reset", "format_card", "erase_file"):
+        sent = page.locator("#sent li").count()
+        page.select_option("#telecommand", row)
+        page.click("#send")
+        page.wait_for_selector("#ask[open]")
+        assert row in page.locator("#ask-text").text_content()
+        page.click("#ask button[value='']")
+        time.sleep(0.2)
+        assert page.locator("#sent li").count() == sent
+
+
+def test_the_form_of_a_level_shows_its_faults_and_injecting_keeps_them(page):
+    open_tab(page, "faults")
+    fault(page, optical={"false_stars": 5})
+    page.wait_for_function(
+        "() => document.querySelector('[data-level=optical] [name=false_stars]').value === '5'"
+    )
+    page.fill("[data-level=optical] [name=missing_stars]", "3")
+    page.click("[data-level=optical] button[type=submit]")
+    page.wait_for_function("() => document.querySelectorAll('#active-faults li').length === 2")
+    active = page.evaluate("starhil.link.control({ do: 'status' })")["faults"]
+    assert active == {"optical": {"false_stars": 5, "missing_stars": 3}}
+    page.click("#active-faults li >> nth=0 >> button")
+    page.wait_for_function("() => document.querySelectorAll('#active-faults li').length === 1")
+    assert page.evaluate("starhil.link.control({ do: 'status' })")["faults"] == {
+        "optical": {"missing_stars": 3}
+    }
+    page.fill("[data-level=optical] [name=false_stars]", "many")
+    page.click("[data-level=optical] button[type=submit]")
+    page.wait_for_function(
+        "() => document.getElementById('fault-outcome').textContent.includes('is not a number')"
+    )
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_everything_fits_the_width_and_text_is_at_least_12_px(page, width):
+    page.set_viewport_size({"width": width, "height": {390: 844, 820: 1180, 3840: 2160}.get(width, 800)})
+    for tab in TABS:
+        open_tab(page, tab)
+        found = page.evaluate(
+            """() => {
+                const seen = [...document.querySelectorAll("button, a, input, select, dd, dt, h1, h2, td, th, label, p, span, code")].filter((each) => each.checkVisibility() && !each.closest(".quiet, .skip, .scroll, #plots, #statistics, .log, select, .message"));
+                const wide = seen.filter((each) => { const box = each.getBoundingClientRect(); return box.width && (box.left < -1 || box.right > innerWidth + 1); });
+                const small = seen.filter((each) => each.textContent.trim() && parseFloat(getComputedStyle(each).fontSize) < 12);
+                const name = (each) => each.id || each.className || each.textContent.slice(0, 30);
+                return { scroll: document.documentElement.scrollWidth, wide: wide.map(name), small: small.map(name) };
+            }"""
+        )
+        assert found == {"scroll": width, "wide": [], "small": []}, tab
+    if width < 600:
+        assert page.evaluate("document.getElementById('tabs').getBoundingClientRect().bottom <= innerHeight")
+
+
+def test_text_follows_the_font_size_of_the_browser(page):
+    before = page.evaluate("getComputedStyle(document.getElementById('ra')).fontSize")
+    page.evaluate("document.documentElement.style.fontSize = '200%'")
+    after = page.evaluate("getComputedStyle(document.getElementById('ra')).fontSize")
+    page.evaluate("document.documentElement.style.fontSize = ''")
+    assert float(after[:-2]) == pytest.approx(2 * float(before[:-2]))
+
+
+def test_numbers_are_in_no_live_region_and_outcomes_are(page):
+    regions = page.evaluate(
+        "[...document.querySelectorAll('output, [role=status], [aria-live]')].map((each) => each.id).sort()"
+    )
+    assert regions == ["active", "link", "mode", "past", "said", "validity"]
+    command(page, "set_mode", mode="lost_in_space")
+    page.wait_for_function(
+        "() => document.getElementById('said').textContent.startsWith('set_mode accepted')"
+    )
+    track(page)
+
+
+def test_messages_are_added_without_making_the_others_again_and_one_opens_with_its_fields(page):
+    open_tab(page, "wire")
+    page.check("#wire label.check:has-text('console') input")
+    command(page, "set_mode", mode="tracking")
+    line = page.locator("#wire .trace li", has_text="set_mode mode=tracking").first
+    line.wait_for()
+    line.evaluate("element => { element.marked = true; }")
+    command(page, "set_mode", mode="tracking")
+    page.wait_for_function(
+        "() => [...document.querySelectorAll('#wire .trace li')].filter((each) => each.textContent.includes('set_mode mode=tracking')).length >= 2"
+    )
+    assert page.evaluate("[...document.querySelectorAll('#wire .trace li')].some((each) => each.marked)")
+    page.locator("#wire .trace li button", has_text="set_mode mode=tracking").first.click()
+    page.wait_for_selector("#wire .message:not([hidden])")
+    assert page.locator("#wire .message tr").first.text_content().startswith("modetracking")
+    page.click("#wire .message button:has-text('close')")
+
+
+def test_paused_is_paused_everywhere_and_arrows_on_a_tab_change_the_tab(page):
+    open_tab(page, "telemetry")
+    page.fill("#telemetry input[type=search]", "precise")
+    page.click("#live")
+    page.wait_for_selector("body.paused")
+    texts = "['utc', 'run', 'ra', 'telemetry', 'truth', 'frame-info'].map((id) => document.getElementById(id).textContent)"
+    before = page.evaluate(texts)
+    time.sleep(1.5)
+    assert page.evaluate(texts) == before
+    page.focus("#tab-telemetry")
+    position = page.evaluate("starhil.store.position")
+    page.keyboard.press("ArrowRight")
+    assert page.get_attribute("#tab-telecommands", "aria-selected") == "true"
+    assert page.evaluate("starhil.store.position") == position
+    page.click("#live")
+    page.fill("#telemetry input[type=search]", "") if page.locator("#telemetry input").is_visible() else None
+
+
+def test_a_reconnection_keeps_filter_forms_and_images(page):
+    open_tab(page, "telecommands")
+    page.select_option("#telecommand", "set_update_rate")
+    page.fill("#telecommand-form [name=rate]", "7.5")
+    page.fill("#telecommands input[type=search]", "rate")
+    image = page.evaluate("starhil.store.images.at(-1).time")
+    end = page.evaluate("starhil.store.rows.end")
+    page.evaluate("starhil.link.socket.close()")
+    page.wait_for_selector("#link[data-state=disconnected]")
+    page.wait_for_selector("#link[data-state=connected]")
+    page.wait_for_function("end => starhil.store.rows.end > end + 2", arg=end)
+    assert page.input_value("#telecommand-form [name=rate]") == "7.5"
+    assert page.input_value("#telecommands input[type=search]") == "rate"
+    assert page.evaluate("image => starhil.store.images.some((each) => each.time === image)", image)
+    page.fill("#telecommands input[type=search]", "")
+
+
+def test_a_turn_that_is_no_number_is_said_and_not_sent(page):
+    open_tab(page, "truth")
+    page.fill("[data-truth=rate] [name=x]", "abc")
+    page.click("[data-truth=rate] button[type=submit]")
+    page.wait_for_function(
+        "() => document.querySelector('#truth .problem').textContent === 'x: “abc” is not a number'"
+    )
+    assert page.evaluate("starhil.link.control({ do: 'status' })")["truth_kind"] == "fixed"
+    page.fill("[data-truth=rate] [name=x]", "0")
+
+
+def test_events_are_listed_and_a_click_shows_the_moment(page):
+    open_tab(page, "events")
+    page.fill("#events form input", "look here")
+    page.click("#events form button")
+    note = page.locator("#events li", has_text="look here")
+    note.wait_for()
+    page.fill("#events input[type=search]", "look")
+    assert page.locator("#events li").count() == 1
+    note.locator("button").click()
+    page.wait_for_selector("body.paused")
+    page.fill("#events input[type=search]", "")
+    page.click("#live")
+
+
+def test_any_telemetry_field_is_plotted_and_a_part_of_the_time_is_enlarged_and_saved(page):
+    page.click("#add-plot")
+    page.check("#chooser input[value='precise_attitude.q_w']")
+    page.check("#chooser input[value=true_ra]")
+    page.click("#chooser button[value=plot]")
+    page.wait_for_function("() => starhil.store.samples.get('precise_attitude')?.length >= 2")
+    assert page.locator("#plots .plot").count() == 6
+    plot = page.locator("#plots .u-over").first
+    plot.scroll_into_view_if_needed()
+    box = plot.bounding_box()
+    page.mouse.move(box["x"] + 0.58 * box["width"], box["y"] + 10)
+    page.mouse.down()
+    page.mouse.move(box["x"] + 0.98 * box["width"], box["y"] + 10, steps=4)
+    page.mouse.up()
+    page.wait_for_function(
+        "() => starhil.charts.zoomed && Math.abs(starhil.charts.to - starhil.charts.from - 24) < 2"
+    )
+    with page.expect_download() as download:
+        page.click("#save-csv")
+    lines = download.value.path().read_text().splitlines()
+    assert lines[0].startswith("series,run_s,unix_s,frame")
+    assert any(line.startswith("precise_attitude,") for line in lines)
+    with page.expect_download() as download:
+        page.click("#save-image")
+    assert download.value.path().read_bytes()[:4] == b"\x89PNG"
+    plot.dblclick()
+    page.wait_for_function("() => !starhil.charts.zoomed && starhil.store.cursor === null")
+    page.click("#statistics summary")
+    page.wait_for_function("() => document.querySelectorAll('#statistics tr').length === 5")
+    page.click("#statistics summary")
+    page.click("#plots button[aria-label^='remove']")
+    assert page.locator("#plots .plot").count() == 5
+
+
+SERIOUS = """async () => {
+    const runOnly = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"];
+    const { violations } = await axe.run(document, { resultTypes: ["violations"], runOnly });
+    return violations.filter((each) => ["critical", "serious"].includes(each.impact)).map((each) => [each.id, each.nodes.length, each.nodes[0].target.join(" "), each.nodes[0].failureSummary]);
+}"""
+STATES = ("live", "paused", "covered", "stuck", "standby", "error")
+
+
+@pytest.mark.skipif(not AXE.is_file(), reason="no axe-core: tools/install_test_packages tests, with npm")
+@pytest.mark.parametrize("state", STATES)
+def test_axe_finds_nothing_serious(page, state):
+    """In both themes: every panel, and every width, of a live page; a panel in the other states."""
+    if state == "covered":
+        fault(page, optical={"blank": True})
+        wait_for_text(page, "#validity", "too few stars")
+    elif state == "stuck":
+        fault(page, device={"stuck": True})
+        page.wait_for_selector("body.past")
+    elif state == "standby":
+        command(page, "set_mode", mode="standby")
+        wait_for_text(page, "#validity", "no images")
+    elif state == "error":
+        fault(page, device={"error": "sensor"})
+        wait_for_text(page, "#mode", "error: sensor")
+    elif state == "paused":
+        page.click("#live")
+    if not page.evaluate("Boolean(window.axe)"):
+        page.evaluate(AXE.read_text())
+    everywhere = state == "live"
+    found = []
+    for _ in ("dark", "light"):
+        page.click("#theme")
+        views = [(1280, tab) for tab in (TABS if everywhere else ("faults",))]
+        for width, tab in (*views, *((width, "telecommands") for width in WIDTHS if everywhere)):
+            page.set_viewport_size({"width": width, "height": 900})
+            open_tab(page, tab)
+            violations = page.evaluate(SERIOUS)
+            found += [(width, tab, *each) for each in violations]
+    if state == "error":
+        command(page, "set_mode", mode="standby")
+    assert found == []

@@ -1,0 +1,43 @@
+"""Python files in the working directory, where others may have put them, are not run by what a command starts."""
+
+from __future__ import annotations
+
+import subprocess
+
+import pytest
+
+from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
+from starhil.hil_tests.rig.emulator_process import EmulatorProcess, hub_command, installed_command
+
+pytestmark = pytest.mark.process
+
+MODULES = ("starhil", "starid", "numpy", "multiprocessing", "json", "struct", "sitecustomize")
+
+
+@pytest.fixture
+def was_run(tmp_path, monkeypatch):
+    """Work in a folder with modules that leave a mark; return the path of the mark."""
+    mark, folder = tmp_path / "mark", tmp_path / "work"
+    folder.mkdir()
+    for module in MODULES:
+        (folder / f"{module}.py").write_text(f"open({str(mark)!r}, 'w').close()\nraise SystemExit(3)\n")
+    monkeypatch.chdir(folder)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    return mark
+
+
+def test_the_image_pipeline_imports_nothing_from_the_working_directory(was_run):
+    WorkerProcess().end()
+    assert not was_run.exists()
+
+
+def test_a_process_that_the_bench_starts_imports_nothing_from_the_working_directory(was_run):
+    with EmulatorProcess(hub_command()) as hub:
+        assert hub.ready["can"]
+    assert not was_run.exists()
+
+
+def test_the_processes_of_a_pool_import_nothing_from_the_working_directory(was_run):
+    words = ["endurance", "--unit", "nos3", "--lives", "2", "--steps", "1", "--jobs", "2", "--rendered", "0"]
+    done = subprocess.run([installed_command(), *words], capture_output=True, text=True, check=False)
+    assert (done.returncode, was_run.exists()) == (0, False), done.stderr
