@@ -449,7 +449,10 @@ def _head_state(head: Head, log: EventLog) -> dict[str, Any]:
         "head": head.number,
         "mode": head.device.modes.mode.value,
         "valid": log.valid,
-        "faults": [f"{level}: {', '.join(content)}" for level, content in levels.items()],
+        "faults": [
+            f"{level}: {', '.join(content) if isinstance(content, dict) else len(content)}"
+            for level, content in levels.items()
+        ],
     }
 
 

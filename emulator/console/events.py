@@ -125,16 +125,7 @@ class EventLog:
 
     def _faults_changed(self, request: dict[str, Any]) -> None:
         """Add what has begun and ended; faults that end by themselves, such as a reset, are in the request alone."""
-        active = {
-            f"{level} {name}": json.dumps(value)
-            for level, content in self._head.faults.describe().items()
-            for name, value in content.items()
-        }
-        asked = {
-            f"{level} {name}": json.dumps(value)
-            for level, content in request.items()
-            for name, value in (content or {}).items()
-        }
+        active, asked = _by_name(self._head.faults.describe()), _by_name(request)
         for name in self._faults:
             if name not in active:
                 self.add("fault", f"end: {name}", "good")
@@ -159,3 +150,14 @@ class EventLog:
             moved_s = (offset_ns - self._offset_ns) / NANOSECONDS
             self._offset_ns = offset_ns
             self.add("clock", f"device clock set, moved by {moved_s:+.6g} s")
+
+
+def _by_name(levels: dict[str, Any]) -> dict[str, str]:
+    """Return the faults of all levels as JSON, by level and name; those of a level with a list have themselves as names."""
+    found: dict[str, str] = {}
+    for level, content in levels.items():
+        if isinstance(content, dict):
+            found |= {f"{level} {name}": json.dumps(value) for name, value in content.items()}
+        elif isinstance(content, list):
+            found |= {f"{level} {json.dumps(fault)}": "true" for fault in content}
+    return found

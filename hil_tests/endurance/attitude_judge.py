@@ -103,6 +103,8 @@ class AttitudeJudge:
         self.count = 0
         self.motions: list[Motion] = []
         self.dark_since_s: float | None = None
+        self.turned_rad: Vector = (0.0, 0.0, 0.0)
+        """Rotation vector in the sensor frame by which a fault turns every reported attitude."""
         self._periods: list[tuple[float, float]] = []
 
     def started(self, now_s: float) -> None:
@@ -178,6 +180,7 @@ class AttitudeJudge:
         """Compare an attitude with the truth at the times at which the exposure may have been."""
         measured = None if stated is None else self._without_mounting(stated[0])
         if stated is not None and measured is not None:
+            measured = product(from_rotation_vector(self.turned_rad), measured)
             self.count += 1
             self._check_error(row, self._errors(measured, now_s, window_s), read, stated[1])
 

@@ -66,6 +66,8 @@ ADDRESSES: Final = frozenset({"can_address", "serial_dialect"})
 """Parameters that the OBC must follow to reach the unit."""
 ADDRESS_SHARE: Final = 0.2
 """Share of these among the parameters that are set."""
+CONTENT_SHARE: Final = 0.03
+"""Share of steps before which the content of telemetry, or the clock, becomes wrong."""
 READ_BACK_SHARE: Final = 0.5
 """Share of telecommands after which a row that reports their effect is read."""
 EFFECTS: Final = {
@@ -161,6 +163,9 @@ class LifeGenerator:
         self._definition = definition
         self._links = links
         self._random = random_of_life
+        self._random_of_content = random.Random(repr(random_of_life.getstate()[1][:4]))  # noqa: S311 (reproducible)
+        """Numbers of its own, so that the steps around these faults are those of a life without them."""
+        self._is_long = is_long
         self._telemetry = list(definition.readable.values())
         self._telecommands = list(definition.telecommands.values())
         self._attitude_rows = [
@@ -218,6 +223,8 @@ class LifeGenerator:
     def steps(self) -> Iterator[Step]:
         """Generate steps without end; the effect of a telecommand is often read back, as an OBC does."""
         while True:
+            if not self._is_long and self._random_of_content.random() < CONTENT_SHARE:
+                yield {"do": "fault", "fault": self._content_fault()}
             (maker,) = self._random.choices(self._makers, self._weights)
             step = maker()
             yield step
@@ -449,6 +456,25 @@ class LifeGenerator:
                 {link: {"delay_s": self._random.uniform(0.0, 3.0), "split": 3 if link == "serial" else 0}}
             )
         return {"do": "fault", "fault": self._random.choice(kinds)}
+
+    def _content_fault(self) -> dict[str, Any]:
+        """Return a fault of the content of telemetry, or of the clock, whose effect is known exactly."""
+        chance = self._random_of_content
+        kinds: list[dict[str, Any]] = [
+            {"telemetry": [{"turn_deg": [round(chance.gauss(0.0, 10.0), 3) for _ in range(3)]}]},
+            {"telemetry": []},
+            {"clock": {"drift_ppm": round(chance.uniform(-200.0, 200.0), 3)}},
+            {"clock": {"jump_s": chance.choice([-0.25, 0.5, 30.0])}},
+        ]
+        if "canopen" not in self._links:
+            row = chance.choice(self._telemetry)
+            kinds.append({"telemetry": [{"row": row.name, "freeze": "all"}]})
+            numbers = [
+                name for name, field in row.named.items() if field.kind == "float" and field.scale == 1.0
+            ]
+            if numbers:
+                kinds.append({"telemetry": [{"row": row.name, "set": {chance.choice(numbers): 0.25}}]})
+        return chance.choice(kinds)
 
     def _power(self) -> Step:
         return {"do": "power", "factory": self._random.random() < 0.4}

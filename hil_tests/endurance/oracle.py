@@ -9,7 +9,7 @@ must never do.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -28,6 +28,8 @@ IMAGING: Final = frozenset({"lost_in_space", "tracking"})
 AT_START: Final = frozenset({"canopen_node"})
 """Parameters of which a new value takes effect at the next start of the unit; all others do at once."""
 SECOND_NS: Final = 1_000_000_000
+FLOAT_GRAIN: Final = {"f32": 1.2e-7, "f64": 4.5e-16}
+"""Relative resolution of a float, twice, by type."""
 
 
 class Oracle:
@@ -65,6 +67,11 @@ class Oracle:
         self.bursts = False
         """Whether packets of a file may arrive."""
         self.now_s = 0.0
+        self._drift_ppm = 0.0
+        self._content: dict[str, Mapping[str, Any]] = {}
+        """Fault of the content of a telemetry row, by its name."""
+        self._frozen: dict[str, bytes] = {}
+        """What a row that is frozen must report."""
         self._frames: int | None = None
         self._selected: int | None = None
         self._last: tuple[int, str] | None = None
@@ -88,6 +95,8 @@ class Oracle:
             self._stored, self._boot_count = {}, 0
         self.now_s = 0.0
         self.stuck = False
+        self._drift_ppm = 0.0
+        self.content_failed(())
         self.disturbed.clear()
         self.attitudes.dark_since_s = None
         self.attitudes.motions = [motion]
@@ -131,6 +140,21 @@ class Oracle:
     def failed(self) -> None:
         """The unit must now be in the error mode, because of a fault or because its image pipeline has ended."""
         self.modes = {"error"}
+
+    def content_failed(self, faults: Sequence[Mapping[str, Any]]) -> None:
+        """The content of telemetry is wrong in these ways from now on, and in no other."""
+        self._content = {fault["row"]: fault for fault in faults if "row" in fault}
+        self._frozen = {}
+        turns = [fault["turn_deg"] for fault in faults if "turn_deg" in fault]
+        x, y, z = (math.radians(angle) for angle in (turns[0] if turns else (0.0, 0.0, 0.0)))
+        self.attitudes.turned_rad = (x, y, z)
+
+    def clock_failed(self, drift_ppm: float, jump_s: float = 0.0) -> None:
+        """The clock drifts by this much from now on, and has jumped."""
+        if self._clock is not None:
+            unix_ns = self._clock[1] + self._elapsed_ns(self._clock[0]) + round(jump_s * SECOND_NS)
+            self._clock = (self.now_s, unix_ns)
+        self._drift_ppm = drift_ppm
 
     def covered(self, *, fully: bool) -> None:
         """The lens has been covered, or is no longer fully covered."""
@@ -297,13 +321,23 @@ class Oracle:
         """Judge the telemetry of a row, received now."""
         if len(data) != row.size:
             raise Violation(f"{row.name}: {len(data)} bytes, not {row.size}")
+        fault = self._content.get(row.name, {})
+        if fault.get("freeze") == "all":
+            if data != self._frozen.setdefault(row.name, data):
+                raise Violation(f"{row.name}: changes, although it is frozen")
+            return
+        given = fault.get("set", {})
         by_quantity: Readings = {}
         for name, value in row.decode(data).items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise Violation(f"{row.name}.{name}: {value}")
-            by_quantity[row.named[name].quantity] = (row.named[name], value)
+            if name not in given:
+                by_quantity[row.named[name].quantity] = (row.named[name], value)
+            elif value != given[name]:
+                raise Violation(f"{row.name}.{name}: {value!r}, although a fault sets it to {given[name]!r}")
         self.judge(row.name, by_quantity)
-        self.judge_attitude(row.name, by_quantity)
+        if not any(row.named[name].quantity.startswith("attitude.") for name in given):
+            self.judge_attitude(row.name, by_quantity)
 
     def judge(self, name: str, read: Readings) -> None:
         """Judge the quantities of a row or PDO, received now, apart from its attitude."""
@@ -355,7 +389,7 @@ class Oracle:
             off = abs((float(value) - expected + 0.5 * span) % span - 0.5 * span)
         else:
             off = abs(float(value) - min(max(expected, low), high))
-        if off > tolerance + field.resolution + 1.2e-7 * abs(expected) * (field.kind == "float"):
+        if off > tolerance + field.resolution + FLOAT_GRAIN.get(field.type, 0.0) * abs(expected):
             raise Violation(f"{where}: {value!r}, not {expected!r}")
 
     def _check_mode(self, where: str, field: Field, value: Value) -> None:
@@ -408,8 +442,13 @@ class Oracle:
         if self._clock is None:
             return None
         since_s, unix_ns = self._clock
-        elapsed_ns = round((self.now_s - since_s) * SECOND_NS)
+        elapsed_ns = self._elapsed_ns(since_s)
         return float(self._definition.conventions.reported_ns(unix_ns + elapsed_ns) / SECOND_NS)
+
+    def _elapsed_ns(self, since_s: float) -> int:
+        """Return what has passed on the clock of the unit, which may drift, since a simulation time, ns."""
+        elapsed_ns = round((self.now_s - since_s) * SECOND_NS)
+        return elapsed_ns + round(elapsed_ns * self._drift_ppm * 1e-6)
 
     def _uptime_s(self) -> float | None:
         return None if self._started_s is None else self.now_s - self._started_s

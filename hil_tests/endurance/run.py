@@ -108,6 +108,11 @@ class LifeRun:
         for link in self._unit.links:
             if LINKS[link].bus in fault:
                 oracle.disturbed.add(link)
+        oracle.time_passed(self._unit.now_s)
+        if "telemetry" in fault:
+            oracle.content_failed(fault["telemetry"])
+        if "clock" in fault:
+            oracle.clock_failed(fault["clock"].get("drift_ppm", 0.0), fault["clock"].get("jump_s", 0.0))
         device = fault.get("device", {})
         oracle.stuck = bool(device.get("stuck", False)) if device else oracle.stuck
         if "reset" in device:
@@ -117,8 +122,12 @@ class LifeRun:
             oracle.failed()
 
     async def _clear(self) -> None:
+        self._obc.hear()  # what was sent before
         self._unit.clear_faults()
         oracle = self._oracle
+        oracle.time_passed(self._unit.now_s)
+        oracle.content_failed(())
+        oracle.clock_failed(0.0)
         oracle.covered(fully=False)
         oracle.stuck = False
         if oracle.disturbed:

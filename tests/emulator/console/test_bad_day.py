@@ -309,12 +309,12 @@ def test_any_telemetry_field_is_plotted_and_a_part_of_the_time_is_enlarged_and_s
     plot = page.locator("#plots .u-over").first
     plot.scroll_into_view_if_needed()
     box = plot.bounding_box()
-    page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 10)
+    page.mouse.move(box["x"] + 0.58 * box["width"], box["y"] + 10)
     page.mouse.down()
-    page.mouse.move(box["x"] + 0.6 * box["width"], box["y"] + 10, steps=4)
+    page.mouse.move(box["x"] + 0.98 * box["width"], box["y"] + 10, steps=4)
     page.mouse.up()
     page.wait_for_function(
-        "() => starhil.charts.zoomed && Math.abs(starhil.charts.to - starhil.charts.from - 18) < 2"
+        "() => starhil.charts.zoomed && Math.abs(starhil.charts.to - starhil.charts.from - 24) < 2"
     )
     with page.expect_download() as download:
         page.click("#save-csv")

@@ -557,6 +557,14 @@ def test_the_timeline_has_what_happened_before_a_page_was_open_and_notes(run):
             await page.ask(do="subscribe", frames=True)
             await page.ask(do="control", request={"do": "fault", "optical": {"blank": True}})
             await emulation.stepper.step(1.0)
+            telemetry = [{"row": "precise_attitude", "freeze": "all"}, {"row": "quaternion", "freeze": "all"}]
+            for count in (2, 1):
+                answer = await page.ask(
+                    do="control", request={"do": "fault", "telemetry": telemetry[:count], "phase": None}
+                )
+                assert answer["ok"], answer
+            status = await page.message("status", lambda item: "telemetry" in item["status"]["faults"])
+            assert any(fault.startswith("telemetry: ") for fault in status["heads"][0]["faults"])
             await page.ask(do="control", request={"do": "clear_faults"})
             await page.ask(do="send", row="set_unix_time", values={"seconds": "1", "nanoseconds": "0"})
             await page.ask(do="send", row="set_update_rate", values={"rate": "500"})
@@ -574,6 +582,7 @@ def test_the_timeline_has_what_happened_before_a_page_was_open_and_notes(run):
             assert ("attitude", "valid") in events
             assert ("fault", "begin: optical blank true") in events
             assert ("fault", "end: optical blank") in events
+            assert ("fault", 'end: telemetry {"row": "quaternion", "freeze": "all"}') in events
             assert ("telecommand", "console: set_update_rate rate=500 refused: invalid_parameter") in events
             assert "clock" in kinds
             assert events[-1] == ("note", "look here")

@@ -111,6 +111,7 @@ export class Faults {
       return;
     }
     if (level === "optical" && this.active.optical && this.active.optical.blank) content.blank = true;
+    if (Array.isArray(this.active[level])) content = [...this.active[level], content];
     if (await this.request({ do: "fault", [level]: content }, `injected: ${this.titles[level]}`)) this.forget(level);
   }
 
@@ -122,7 +123,9 @@ export class Faults {
 
   // End one fault and leave the others of its level.
   end(level, name) {
-    const content = { ...this.active[level] };
+    const active = this.active[level];
+    if (Array.isArray(active)) return this.request({ do: "fault", [level]: active.filter((_, number_) => String(number_) !== name) }, `ended: ${level}`);
+    const content = { ...active };
     delete content[name];
     if (level === "device") content[name] = false;
     return this.request({ do: "fault", [level]: content }, `ended: ${name}`);
@@ -163,9 +166,11 @@ export class Faults {
       const idle = Object.fromEntries((this.store.hello.faults.find((each) => each.level === level)?.controls || []).map((each) => [each.name, each.default]));
       for (const [name, item] of Object.entries(content)) {
         if (level !== "optical" && (item === idle[name] || item === false)) continue;
-        const label = `${this.titles[level] || level}: ${name} ${shown(item)}`.trim();
+        const listed = Array.isArray(content);
+        const label = `${this.titles[level] || level}: ${listed ? "" : name} ${shown(item)}`.trim();
         const end = make("button", { type: "button", class: "small", text: "×", "aria-label": `end ${label}`, onclick: () => this.end(level, name) });
-        chips.push(make("li", {}, make("span", { text: label }), make("fieldset", { class: "commands" }, end)));
+        const known = (this.forms[level] || []).some((each) => each.name === name) || name === "blank" || listed;
+        chips.push(make("li", {}, make("span", { text: label }), make("fieldset", { class: "commands" }, ...(known ? [end] : []))));
       }
     }
     this.now.replaceChildren(...chips);
