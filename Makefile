@@ -51,8 +51,9 @@ test: $(VENV)/.developer
 	-@tools/install_test_packages tests obc
 	@tools/test_in_lanes $(BIN)/python
 
-# of `check`, beside the tests that start processes: what computes for long, and few changes touch
-LONG := $(addprefix tests/,process fuzzing conformance hil_tests/endurance emulator/benchmarks starid/kernels starid/lab starid/identification/thesis) \
+# of `check`, beside the tests that start processes: what computes for long, or waits for the clock
+LONG := $(addprefix tests/,process fuzzing conformance test_docs.py hil_tests/endurance hil_tests/timing hil_tests/rig starid/kernels starid/lab) \
+	$(addprefix tests/emulator/,benchmarks console launch device/test_extreme_values.py) $(addprefix tests/starid/,cli identification/thesis) \
 	$(wildcard tests/protocol/canopen/test_conformance*.py) tests/protocol/test_fuzz.py
 QUICK = $(BIN)/python -m pytest -q -m "not process and not browser and not socketcan" $(LONG:%=--ignore=%)
 check: $(VENV)/.developer

@@ -94,7 +94,7 @@ def run_features(out: Path) -> str | None:
     if subprocess.run(command, check=False).returncode != 0:
         return None
     images = read_csv(folder / "truth.csv")
-    refined = images["refined"] == "true"
+    refined = images["refined"] == 1
     region = np.count_nonzero(refined & (images["search"] == "rsi"))
     return (
         f'run.algorithm = "rsi": features found, and stars verified, {np.count_nonzero(refined)} of {len(images)} images, '

@@ -180,8 +180,8 @@ _LONGEST_SHOWN: Final = 200
 
 _A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
 FAULT_KEY_HINTS: Final = dict.fromkeys(
-    ("fault", "faults", "optical", "telemetry", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
-     "delay_s", "split", "gap_s"),
+    ("fault", "faults", "optical", "telemetry", "serial", "can", "stuck", "error", "reset", "upset", "clock", "phase", "drop", "corrupt",
+     "junk", "delay_s", "split", "gap_s"),
     _A_FAULT,
 )  # fmt: skip
 """Keys of faults, which a profile does not have, and the hint for whoever writes one there."""

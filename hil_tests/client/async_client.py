@@ -122,7 +122,7 @@ class AsyncObcClient:
         request = self.icd.request(row, data)
         if not self.link.answers(row):
             self.link.request(request)
-            return Ack(row.name, 0.0)
+            return Ack(row.name, 0.0, answered=False)
         _reply, latency = await self.transact(request, row.name, timeout_s=timeout_s, retries=retries)
         return Ack(row.name, latency)
 

@@ -18,6 +18,8 @@ class Ack:
     name: str
     latency_s: float = field(compare=False)
     """Time from passing the request to the port until the last byte of the reply, s."""
+    answered: bool = field(default=True, compare=False)
+    """Whether the unit acknowledges this telecommand on this link; otherwise it was only sent."""
 
 
 @dataclass(frozen=True)

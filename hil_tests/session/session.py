@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from starhil.hil_tests.attitude import Quaternion
@@ -88,15 +88,31 @@ def _run_step(session: SessionState, number: int, step: Step, link: str) -> Step
 
 def _try_until_passed(session: SessionState, step: Step, link: str) -> Attempt:
     """Try an action once, or repeatedly until its expectations hold or its time is over."""
-    deadline = None if step.within_s is None else time.monotonic() + step.within_s
+    begin = time.monotonic()
+    problems: list[str] = []
     while True:
         attempt = _try_once(session, step, link)
-        if attempt.problem is None or deadline is None:
+        if step.within_s is None:
             return attempt
+        if attempt.problem is None:
+            if problems:
+                held = f"after {time.monotonic() - begin:.2f} s"
+                attempt.detail = f"{held}: {attempt.detail}" if attempt.detail else held
+            return attempt
+        problems.append(attempt.problem)
+        deadline = begin + step.within_s
         if time.monotonic() >= deadline:
-            attempt.problem = f"not within {step.within_s:g} s: {attempt.problem}"
+            attempt.problem = f"not within {step.within_s:g} s: {_of_attempts(problems)}"
             return attempt
         time.sleep(min(step.pause_s, max(0.0, deadline - time.monotonic())))
+
+
+def _of_attempts(problems: Sequence[str]) -> str:
+    """Return what was wrong in the first and the last attempt, and how many there were."""
+    first, last = problems[0], problems[-1]
+    if first == last:
+        return last if len(problems) == 1 else f"{last} ({len(problems)} attempts; the first was the same)"
+    return f"{last} (attempt {len(problems)}; the first: {first})"
 
 
 def _try_once(session: SessionState, step: Step, link: str) -> Attempt:

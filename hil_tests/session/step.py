@@ -206,4 +206,6 @@ class RequestStep(Step):
             return Attempt(detail=f"refused with {error.code} ({self.refused}), as expected"), None
         if self.refused is not None:
             return Attempt(problem=f"accepted, expected to be refused with {self.refused}"), answer
+        if isinstance(answer, Ack) and not answer.answered:
+            return Attempt(detail="sent; no reply is expected"), answer
         return Attempt(detail="accepted", latency_s=answer.latency_s), answer

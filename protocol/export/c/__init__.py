@@ -7,6 +7,7 @@ files `*.h` and `*.c` of this folder, in which `unit_` and `UNIT_` are replaced 
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Iterator, Mapping
 from typing import Final
 
@@ -14,9 +15,11 @@ from starhil.protocol.export.c.composed import link_parts
 from starhil.protocol.export.c.rows import RowCode
 from starhil.protocol.export.templates import fill, text_of
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.icd.quoting import Scope, c_comment, identifier
+from starhil.protocol.icd.quoting import Scope, c_comment, c_string, identifier
 from starhil.protocol.serial.stack import SerialStack
 
+VERSION_MACROS: Final = ("DEFINITION_VERSION", "DEFINITION_CRC32")
+_PLAIN: Final = re.compile(r"[A-Za-z0-9._+-]*")
 _FUNCTION: Final = re.compile(r"^static .*?\b(\w+)\(", re.MULTILINE)
 
 
@@ -43,12 +46,15 @@ def files(icd: InterfaceDefinition, stack: SerialStack) -> Mapping[str, str]:
     named = [_named(text, prefix) for text in templates]
     codec_header, link_header, codec, helpers, head, link_code = named
     rows = RowCode(icd, prefix, Scope("C", re.findall(r"\w+", f"{prefix.upper()}_H {' '.join(named)}")))
+    for macro in VERSION_MACROS:
+        rows.scope.claim(f"{prefix.upper()}_{macro}", "the version of the definition")
     declarations, codecs = rows.fill(icd, key_type)
+    content = "\n".join((codec_header, declarations.rstrip("\n") + "\n", link_header))
     header = fill(
         "c/header.h.j2",
         about=c_comment(f"{icd.name} {icd.version}: {icd.doc}", _USE.format(prefix=prefix)),
         guard=f"{prefix.upper()}_H",
-        content="\n".join((codec_header, declarations.rstrip("\n") + "\n", link_header)),
+        content=f"{_version(icd, prefix.upper(), content)}\n{content}",
     )
     static = "\n\n".join((codec, *map(rows.membership, rows.enumerations), helpers))
     source = [
@@ -60,6 +66,17 @@ def files(icd: InterfaceDefinition, stack: SerialStack) -> Mapping[str, str]:
         link_code,
     ]
     return {f"{prefix}.h": header, f"{prefix}.c": "\n".join(source)}
+
+
+def _version(icd: InterfaceDefinition, prefix: str, content: str) -> str:
+    """Return macros with the version of the definition, and with a checksum of all that its header declares."""
+    version, checksum = VERSION_MACROS
+    text = f'"{icd.version}"' if _PLAIN.fullmatch(icd.version) else c_string(icd.version)
+    crc = zlib.crc32(f"{icd.version}\n{content}".encode())
+    return (
+        f"/* The definition: its version, and a CRC-32 of version and declarations. */\n"
+        f"#define {prefix}_{version} {text}\n#define {prefix}_{checksum} 0x{crc:08X}u\n"
+    )
 
 
 def prefix_of(icd: InterfaceDefinition) -> str:

@@ -23,7 +23,7 @@ class RowCode:
 
     def __init__(self, icd: InterfaceDefinition, prefix: str, scope: Scope) -> None:
         self._prefix = prefix
-        self._scope = scope
+        self.scope = scope
         self.enumerations: Final[dict[str, EnumDefinition]] = {}
         """The enumerations of the definition and of the fields of its rows, by name in C."""
         for name, enum in icd.enums.items():
@@ -41,9 +41,9 @@ class RowCode:
                 scope.claim(claimed, f"{row.kind} {row.name}")
 
     def _add_enumeration(self, name: str, enum: EnumDefinition, owner: str) -> None:
-        self._scope.claim(f"is_in_{name}", owner)
+        self.scope.claim(f"is_in_{name}", owner)
         for member in enum.values:
-            self._scope.claim(self._constant(name, member), f"{owner}: {one_line(member)!r}")
+            self.scope.claim(self._constant(name, member), f"{owner}: {one_line(member)!r}")
         self.enumerations[name] = enum
 
     def fill(self, icd: InterfaceDefinition, key_type: str) -> tuple[str, str]:

@@ -3,30 +3,28 @@
 import json
 import math
 import re
-import shutil
 import socket
 import subprocess
-import threading
-import time
 import urllib.error
 import urllib.request
-from contextlib import contextmanager, suppress
 from urllib.parse import urlsplit
 
 import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, installed_command
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
+from tests.emulator.console.browser import (
+    MARKS,
+    WITHIN_MS,
+    chromium,
+    opened,
+    slow_link,
+    wait_for_text,
+)
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-WITHIN_MS = 30_000
 UPDATE_RATE_HZ = 5
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.process,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: as root, apt-get install chromium"),
-]
+pytestmark = MARKS
 
 
 @pytest.fixture(scope="module")
@@ -47,28 +45,14 @@ def emulator():
 
 @pytest.fixture(scope="module")
 def browser():
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield chromium
-        chromium.close()
+    with chromium() as started:
+        yield started
 
 
 @pytest.fixture
 def page(browser, emulator):
-    """The console's page; whatever the browser's console says is a failure."""
-    opened = browser.new_page(viewport={"width": 1280, "height": 800})
-    opened.set_default_timeout(WITHIN_MS)
-    said = []
-    opened.on("console", lambda message: said.append(message.text))
-    opened.on("pageerror", lambda error: said.append(str(error)))
-    opened.goto(emulator.ready["view"])
-    opened.wait_for_selector("#link[data-state=connected]")
-    opened.wait_for_function("() => starhil.store.hello")
-    yield opened
-    opened.close()
-    assert said == []
+    with opened(browser, emulator.ready["view"]) as page:
+        yield page
 
 
 def send(page, name, **values):
@@ -85,12 +69,6 @@ def send(page, name, **values):
     page.click("#send")
     page.wait_for_function("count => document.querySelectorAll('#sent li').length > count", arg=count)
     return page.locator("#sent li .outcome").first.text_content()
-
-
-def wait_for_text(page, selector, text):
-    page.wait_for_function(
-        "([selector, text]) => document.querySelector(selector).textContent === text", arg=[selector, text]
-    )
 
 
 VALUES = "row => Object.fromEntries([...document.querySelectorAll(`[data-row=${row}] tr`)].map(tr => [tr.cells[0].textContent, tr.cells[1].textContent]))"
@@ -359,39 +337,10 @@ SLOW_BYTES_S = 100_000
 """Rate of a slow link: a third of what images at 5 Hz need."""
 
 
-@contextmanager
-def slow_link(port):
-    """Yield the port of a proxy that passes bytes from a server at `SLOW_BYTES_S`, with small buffers."""
-
-    def pump(source, sink, pause_s):
-        with suppress(OSError):
-            while data := source.recv(2048):
-                sink.sendall(data)
-                time.sleep(len(data) * pause_s)
-        for each in (source, sink):
-            with suppress(OSError):
-                each.shutdown(socket.SHUT_RDWR)
-
-    def serve():
-        with suppress(OSError):
-            while True:
-                client, _ = listener.accept()
-                server = socket.socket()
-                server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8192)
-                server.connect(("127.0.0.1", port))
-                for arguments in ((client, server, 0.0), (server, client, 1.0 / SLOW_BYTES_S)):
-                    threading.Thread(target=pump, args=arguments, daemon=True).start()
-
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        threading.Thread(target=serve, daemon=True).start()
-        yield listener.getsockname()[1]
-        listener.shutdown(socket.SHUT_RDWR)
-
-
 def test_over_a_slow_link_images_are_left_out_and_numbers_are_not(page, browser, emulator):
     track(page)
     port = urlsplit(emulator.ready["view"]).port
-    with slow_link(port) as slow_port:
+    with slow_link(port, SLOW_BYTES_S) as slow_port:
         slow = browser.new_page()
         slow.set_default_timeout(WITHIN_MS)
         slow.goto(emulator.ready["view"].replace(str(port), str(slow_port)))

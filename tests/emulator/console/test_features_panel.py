@@ -4,13 +4,10 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
-from tests.emulator.console.test_browser import CHROMIUM, browser, page, send  # noqa: F401 (fixtures)
+from tests.emulator.console.browser import MARKS
+from tests.emulator.console.test_browser import browser, page, send  # noqa: F401 (fixtures)
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.process,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium: as root, apt-get install chromium"),
-]
+pytestmark = MARKS
 
 SETTINGS = (
     "run.algorithm=rsi", "truth.kind=rate", "truth.attitude.ra_deg=83.8", "truth.attitude.dec_deg=-1.2",
@@ -51,9 +48,11 @@ def test_features_region_and_removed_detections_are_shown(page):  # noqa: F811
     crossed = page.evaluate(
         """() => {
           const { sky } = starhil, { head } = sky.shown, ratio = window.devicePixelRatio || 1;
+          const { width, height } = sky.overlay;
+          const ink = sky.overlay.getContext("2d").getImageData(0, 0, width, height).data;
           return head.features.removed.map((row) => {
-            const [x, y] = sky.place(head.detections[row][0], head.detections[row][1]);
-            return sky.overlay.getContext("2d").getImageData(Math.round(x * ratio), Math.round(y * ratio), 1, 1).data[3];
+            const [x, y] = sky.place(head.detections[row][0], head.detections[row][1]).map((at) => Math.floor(at * ratio));
+            return Math.max(...[-1, 0, 1].map((step) => ink[4 * (y * width + x + step) + 3]));
           });
         }"""
     )

@@ -50,7 +50,9 @@ def report_of(folder):
 
 async def talk(emulation, frames):
     """Command and read the device over its serial line, as an OBC does, for some frames."""
-    client = AsyncObcClient(SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd)
+    client = AsyncObcClient(
+        SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
+    )
     await client.start()
     await client.set_parameter("exposure", 80)
     await client.command("save_parameters")
@@ -139,7 +141,7 @@ def test_can_frames_and_canopen_are_repeated(record):
     bus = "virtual:recorded"
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink(bus), emulation.icd)
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=WITHIN_S)
         await client.start()
         async with asyncio.timeout(WITHIN_S):
             while emulation.device.cycle.published < 4:
@@ -158,7 +160,7 @@ def test_frames_that_are_sent_with_gaps_and_delays_are_repeated(record):
     """The gap between two frames passes after the request, while other entries arrive."""
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink("virtual:gaps"), emulation.icd)
+        client = AsyncObcClient(CanHostLink("virtual:gaps"), emulation.icd, timeout_s=WITHIN_S)
         await client.start()
         async with Control(emulation) as control:
             for fault in ({"delay_s": 0.02}, {}):
@@ -174,7 +176,7 @@ def test_frames_that_are_sent_with_gaps_and_delays_are_repeated(record):
 def test_a_unit_without_dialects_is_repeated_at_its_own_bit_rate(record):
     async def scenario(emulation, _line):
         client = AsyncObcClient(
-            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
         )
         await client.start()
         for _ in range(5):
@@ -220,7 +222,7 @@ def test_a_run_whose_pipeline_dies_and_is_restarted_is_repeated(record, clock):
             while not device.warm:
                 await asyncio.sleep(0.05)
         client = AsyncObcClient(
-            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
         )
         await client.start()
         await client.command("set_mode", mode="standby")
@@ -299,7 +301,7 @@ def test_a_changed_byte_of_a_message_that_no_longer_decodes_is_named(record, at,
 
     async def scenario(emulation, _line):
         client = AsyncObcClient(
-            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
         )
         await client.start()
         await client.command("go")
@@ -329,7 +331,7 @@ def test_a_changed_address_of_a_can_frame_is_shown_in_both_frames(record):
     bus = "virtual:id"
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink(bus), emulation.icd)
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=WITHIN_S)
         await client.start()
         for name in ("identification", "device_status", "identification"):
             await client.telemetry(name)
@@ -348,7 +350,7 @@ def test_a_changed_can_frame_is_named_by_its_row_or_its_meaning_in_canopen(recor
     bus = "virtual:changed"
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink(bus), emulation.icd)
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=WITHIN_S)
         await client.start()
         await client.telemetry("device_status")
         await client.close()

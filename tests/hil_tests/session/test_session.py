@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import signal
 import threading
 from itertools import pairwise
@@ -301,7 +302,14 @@ def test_a_step_is_retried_until_it_passes_or_times_out(play, device):
         "[[step]]\nread = 'rates'\nexpect = { rate_x = 1 }\nwithin_s = 0.1\nevery_s = 0.01"
     )
     assert [item.status for item in result.results] == ["passed", "failed"]
+    assert re.match(r"after \d+\.\d\d s: ", result.results[0].detail)
     assert result.results[1].detail.startswith("not within 0.1 s: rate_x is 0")
+    assert re.search(r"\(\d+ attempts; the first was the same\)$", result.results[1].detail)
+
+
+def test_a_telecommand_that_is_not_answered_is_sent(play):
+    result = play("[[step]]\ncommand = 'reset'\n")
+    assert result.results[0].detail == "sent; no reply is expected"
 
 
 def test_repeats_must_all_hold(play, device):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from starhil.protocol.can.cubespace import CanHostReceiver, encode_reply_frames, encode_request_frames
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.export.c import prefix_of, render_folder
 from starhil.protocol.icd import FieldError
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
@@ -281,3 +283,15 @@ def test_the_rows_of_a_unit_have_the_same_bytes_and_values_both_ways(name: str, 
                 refused_at(row, data),
                 c_words(row, row.decode(data, check=False)),
             )
+
+
+def test_the_header_has_version_and_checksum_of_the_definition() -> None:
+    icd = load_unit("sagitta")
+    header = next(text for name, text in render_folder(icd).items() if name.endswith(".h"))
+    prefix = prefix_of(icd).upper()
+    assert f'#define {prefix}_DEFINITION_VERSION "{icd.version}"' in header
+    (checksum,) = re.findall(rf"#define {prefix}_DEFINITION_CRC32 (0x[0-9A-F]{{8}})u", header)
+    assert next(iter(render_folder(icd).values())) == header
+    other = replace(icd, version="another")
+    (changed,) = re.findall(r"DEFINITION_CRC32 (0x[0-9A-F]{8})u", next(iter(render_folder(other).values())))
+    assert changed != checksum

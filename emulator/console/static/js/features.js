@@ -39,7 +39,7 @@ export class Features {
 
 // Cross out the detections that the filter removed; `place` gives the place of a position on the screen.
 export function drawRemoved(context, head, place) {
-  context.strokeStyle = colour("bad");
+  context.strokeStyle = colour("on-sky-bad");
   context.lineWidth = 1.5 * pen();
   const arm = 7 * pen();
   for (const row of (head.features && head.features.removed) || []) {
