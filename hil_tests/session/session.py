@@ -34,7 +34,7 @@ def run_steps(
     truth: Quaternion | TruthOverTime | None = script.truth.attitude
     if truth_path is not None:
         truth = TruthLogReader(truth_path)
-    elif rig.has_control_of_another:
+    elif truth is None and rig.has_control_of_another:
         truth = ControlledTruth(rig)
     elif script.truth.file is not None:
         truth = TruthLogReader(folder / script.truth.file)
