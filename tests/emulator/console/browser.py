@@ -14,7 +14,8 @@ from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_com
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-WITHIN_MS = 30_000
+WITHIN_MS = 120_000
+"""What a page and an emulator may take on a machine that runs all tests at once."""
 
 AXE = (
     Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
