@@ -72,7 +72,10 @@ def write_package(folder: Path, *, slope: float = 2.0) -> Path:
 def process(folder: Path) -> subprocess.Popen[str]:
     """Start a process that calls the kernel; without bytecode, which is compared by the second of its source."""
     command = [sys.executable, "-B", "-c", RUN]
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    return subprocess.Popen(
+        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def run(folder: Path, warning: str = "") -> list[str]:
