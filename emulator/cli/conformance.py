@@ -81,6 +81,8 @@ class CaseOptions:
             canopen = int(icd.parameters["canopen_node"].default)
         everything = links_of(icd, canopen) if bench.start or list_only else (None, None)
         serial, can = links_to_use(bench.serial, bench.can, everything)
+        if self.canopen is not None and can is None:
+            raise BenchError("--canopen needs --can: give the channel of the node")
         if serial is None and can is None:
             raise BenchError("no link: use --serial DEV, --can CHANNEL, --canopen NODE, or --start")
         settings = with_orbit(self.settings, self.orbit)
@@ -89,8 +91,6 @@ class CaseOptions:
             raise BenchError(f"{option} needs --start: it overrides a key of the emulator's profile")
         if self.truth is not None and bench.start:
             raise BenchError("--truth is for a unit that runs already; with --start the truth is known")
-        if self.canopen is not None and can is None:
-            raise BenchError("--canopen needs --can: give the channel of the node")
         if not bench.start and not list_only and serial == "auto":
             raise BenchError("--serial auto needs --start; otherwise name the port")
         return ConformanceRequest(

@@ -34,12 +34,12 @@ def command(
     async def serve() -> None:
         hub = CanHub(host, port, log=log)
         await hub.start()
-        print(f"ready can=socketcand:{hub.host}:{hub.port}/{DEFAULT_BUS}", flush=True)
         ended = asyncio.Event()
         loop = asyncio.get_running_loop()
         log_loop_errors_once(loop)
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, ended.set)
+        print(f"ready can=socketcand:{hub.host}:{hub.port}/{DEFAULT_BUS}", flush=True)
         await ended.wait()
         await hub.close()
         counters = hub.statistics

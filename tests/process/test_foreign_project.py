@@ -18,7 +18,7 @@ PACKAGES = {
     **{name: f"starhil/{name}" for name in ("emulator", "protocol", "hil_tests", "configs")},
 }
 """Where the files of each folder are in the wheel."""
-QUICK = 'extends = "ideal"\n[run]\nworker = "error_model"\n'
+QUICK = 'extends = "cubestar"\n[run]\nworker = "error_model"\n'
 """Profile without images: kernels of another installation would be compiled for a minute, as those of the first start."""
 OUR_ROOMS = ("emulator", "protocol", "hil_tests", "configs", "tools", "tests")
 

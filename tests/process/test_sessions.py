@@ -120,7 +120,7 @@ def test_a_session_injects_faults_into_the_emulator_that_it_started(tmp_path):
     done = starhil("session", script, "--start", "--serial", "auto", "--log", tmp_path, "--json")
     result = json.loads(done.stdout)
     assert [item["status"] for item in result["results"]] == 5 * ["passed"] + ["failed"]
-    assert result["results"][1]["detail"] == '{"faults": {"optical": {"blocked_share": 1.0}}}'
+    assert result["results"][1]["detail"] == "faults optical blocked_share 1"
     assert "blocked_shar: unknown key; did you mean blocked_share?" in result["results"][5]["detail"]
 
 
