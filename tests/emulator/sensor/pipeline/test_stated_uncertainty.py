@@ -50,5 +50,7 @@ def test_trails_do_not_make_the_stated_uncertainty_too_small(rate_deg_s: float, 
     over = errors_over_stated("ideal", rate_deg_s, 200, f"parameters.exposure={exposure_ms}")
     assert np.mean(over**2) == pytest.approx(1.0, abs=SIGMAS * math.sqrt(2.0 / over.size))
     for limit, share in ((1.0, 0.683), (2.0, 0.954), (3.0, 0.9973)):
-        sampling = math.sqrt(share * (1.0 - share) / len(over))  # the errors of a frame have the same stars and one stated value
+        sampling = math.sqrt(
+            share * (1.0 - share) / len(over)
+        )  # the errors of a frame have the same stars and one stated value
         assert np.mean(np.abs(over) < limit) > share - SIGMAS * sampling
