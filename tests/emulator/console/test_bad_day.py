@@ -304,7 +304,7 @@ def test_any_telemetry_field_is_plotted_and_a_part_of_the_time_is_enlarged_and_s
     page.check("#chooser input[value='precise_attitude.q_w']")
     page.check("#chooser input[value=true_ra]")
     page.click("#chooser button[value=plot]")
-    page.wait_for_function("() => starhil.store.samples.get('precise_attitude')?.length >= 2")
+    page.wait_for_function("() => starhil.store.samples.get('precise_attitude')?.length >= 20")
     assert page.locator("#plots .plot").count() == 6
     plot = page.locator("#plots .u-over").first
     plot.scroll_into_view_if_needed()
