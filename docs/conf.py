@@ -41,6 +41,7 @@ LINKS = {
     "docs/": "",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
     "CITATION.cff": "../CITATION.cff",
 }
 """Beginning of a link in the README → what it is among the pages."""
