@@ -166,6 +166,10 @@ def test_the_present_value_of_a_parameter_is_shown_with_its_unit_and_follows_the
     wait_for_text(page, note, "now 200 ms\n1 … 5000")
     send(page, "set_parameter", parameter=1, value=100)
     wait_for_text(page, note, "now 100 ms\n1 … 5000")
+    assert page.evaluate(  # as another OBC would
+        "starhil.link.request({do: 'send', row: 'set_parameter', values: {parameter: 1, value: 150}})"
+    )["ok"]
+    wait_for_text(page, note, "now 150 ms\n1 … 5000")
     page.select_option("#telecommand-form [name=parameter]", "13")
     page.wait_for_function(
         "selector => document.querySelector(selector).textContent.includes(' px\\n')", arg=note

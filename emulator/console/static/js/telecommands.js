@@ -13,7 +13,10 @@ export class Telecommands {
     this.chosen = null;
     store.on("hello", (hello) => this.build(hello));
     store.on("sent", (message) => this.note(message));
-    store.on("status", (message) => this.count(message.session_steps));
+    store.on("status", (message) => {
+      this.count(message.session_steps);
+      this.followParameter();
+    });
   }
 
   build(hello) {
@@ -71,24 +74,32 @@ export class Telecommands {
       this.showParameter();
     };
     if ("value" in values) this.form.elements.value.dataset.edited = "yes";
-    this.preview();
     this.showParameter();
   }
 
   // Beside a value for a parameter: its unit, limits and present value, with which the field begins.
   async showParameter() {
-    const [select, note] = ["[data-parameters]", "[data-note=value]"].map((selector) => this.form.querySelector(selector));
-    this.limits = null;
-    if (!select || !note) return;
+    const select = this.form.querySelector("[data-parameters]");
+    this.limits = select && this.parameters.find((item) => String(item.id) === select.value);
+    await this.followParameter();
+    this.preview();
+  }
+
+  // Show the present value again: this page's telecommand, another OBC or a reset may have changed it.
+  async followParameter() {
+    const parameter = this.limits;
+    const note = this.form && this.form.querySelector("[data-note=value]");
+    if (!parameter || !note || this.host.offsetParent === null) return;
     const { values } = await this.link.request({ do: "parameters" });
-    const parameter = this.parameters.find((item) => String(item.id) === select.value);
+    if (parameter !== this.limits) return; // another was chosen meanwhile
     const { name, unit, min, max } = parameter;
-    this.limits = parameter;
     const field = this.form.elements.value;
-    if (values && field && !field.dataset.edited) field.value = String(values[name]);
+    if (values && field && !field.dataset.edited && field.value !== String(values[name])) {
+      field.value = String(values[name]);
+      this.preview();
+    }
     const present = values ? [short(values[name]), unit].filter(Boolean).join(" ") : "–";
     setText(note, `now ${present}\n${short(min)} … ${short(max)}`);
-    this.preview();
   }
 
   control(field) {
