@@ -67,10 +67,10 @@ SUFFIXES: Final = {
 CHOICES: Final = {"bits": "`8`, `12`, `16`"}
 """Values of keys that are not all of a range."""
 
-OF_PARAMETERS: Final = ("exposure_s", "gain")
+PARAMETER_FIELDS: Final = ("exposure_s", "gain")
 """Fields of the sensor model that are parameters of the device, not keys of `[sensor]`."""
 
-LARGE: Final = 1e6
+EXPONENT_FROM: Final = 1e6
 """Numbers from here on are shown with an exponent if no digits are lost."""
 
 Row = tuple[str, ...]
@@ -101,7 +101,7 @@ def literal(value: object) -> str:
         return "`{ " + ", ".join(f"{key} = {json.dumps(item)}" for key, item in items) + " }`"
     if value is None or value in ({}, ""):
         return ""
-    if isinstance(value, float) and value >= LARGE and float(f"{value:g}") == value:
+    if isinstance(value, float) and value >= EXPONENT_FROM and float(f"{value:g}") == value:
         return f"`{value:g}`"
     plain = list(value) if isinstance(value, tuple) else value
     return f"`{json.dumps(plain, ensure_ascii=False)}`"
@@ -120,46 +120,46 @@ def attribute_docstrings(model: type, *, grouped: bool = False) -> dict[str, str
     SystemExit
         A field has no docstring; the message names it.
     """
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for kind in reversed(model.__mro__):
         if kind.__module__.startswith(("starhil.", "starid.")):
-            found |= {name: text or found.get(name, "") for name, text in _own_docstrings(kind).items()}
+            texts |= {name: text or texts.get(name, "") for name, text in _own_docstrings(kind).items()}
     if grouped:
         text = ""
-        for name in reversed(found):
-            text = found[name] = found[name] or text
-    bare = [name for name, text in found.items() if not text and not name.startswith("_")]
+        for name in reversed(texts):
+            text = texts[name] = texts[name] or text
+    bare = [name for name, text in texts.items() if not text and not name.startswith("_")]
     if bare:
         raise SystemExit(
             f"{model.__module__}.{model.__qualname__}.{bare[0]}: has no docstring; write one under it"
         )
-    return found
+    return texts
 
 
 def _own_docstrings(kind: type) -> dict[str, str]:
     """Return the docstring under each field that a class itself declares; empty if there is none."""
     module = ast.parse(textwrap.dedent(inspect.getsource(kind)))
     body = next(node.body for node in module.body if isinstance(node, ast.ClassDef))
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for statement, after in zip(body, [*body[1:], None], strict=True):
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
             is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
-            found[statement.target.id] = plain_text(str(after.value.value)) if is_text else ""
-    return found
+            texts[statement.target.id] = plain_text(str(after.value.value)) if is_text else ""
+    return texts
 
 
 def documented_names(item: Any) -> dict[str, str]:
     """Return name → description from the sections of a numpy docstring."""
     lines = inspect.cleandoc(item.__doc__ or "").splitlines()
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     names: list[str] = []
     for line, after in zip(lines, [*lines[1:], ""], strict=True):
         if line.startswith("    "):
             for name in names:
-                found[name] = f"{found.get(name, '')} {line.strip()}".strip()
+                texts[name] = f"{texts.get(name, '')} {line.strip()}".strip()
         elif line and not after.startswith("---"):
             names = [name.strip() for name in line.partition(" : ")[0].split(",")]
-    return {name: plain_text(text) for name, text in found.items()}
+    return {name: plain_text(text) for name, text in texts.items()}
 
 
 # --- pydantic models ---
@@ -283,7 +283,7 @@ def sensor() -> str:
     """Keys of `[sensor]`."""
     from starhil.emulator.sensor.model import SensorModel
 
-    return table(dataclass_rows(SensorModel, OF_PARAMETERS))
+    return table(dataclass_rows(SensorModel, PARAMETER_FIELDS))
 
 
 def sky() -> str:

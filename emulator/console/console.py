@@ -467,7 +467,6 @@ def _count(request: dict[str, Any], key: str) -> int:
 
 
 def _table(request: dict[str, Any], key: str) -> dict[str, Any]:
-    """Return a table of a request."""
     value = request.get(key, {})
     if not isinstance(value, dict):
         raise EmulatorError(f"{key}: must be an object")

@@ -71,14 +71,14 @@ def received(probe: SerialProbe, sent: bytes) -> Sequence[Message]:
     while probe.now() < end and not (before == len(probe.raw) > 0):
         before = len(probe.raw)
         probe.sleep(quiet_s)
-    found, raw = [], probe.raw
+    messages, raw = [], probe.raw
     for piece in filter(None, raw.split(b"\xc0")):
         body = piece.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
         check(body[:2] == bytes((OBC, TRACKER)), f"addresses {OBC:02X} {TRACKER:02X}", body[:2].hex(" "))
         check(crc(body[:-2]) == body[-2:], f"CRC {crc(body[:-2]).hex(' ')}", body[-2:].hex(" "))
-        found.append(Message(body[2], body[3:-2]))
+        messages.append(Message(body[2], body[3:-2]))
     probe.drain()
-    return found
+    return messages
 
 
 def reply(probe: SerialProbe, code: int, data: bytes = b"") -> bytes:
@@ -226,17 +226,17 @@ def solved(probe: SerialProbe) -> bytes:
 
 @COMBINED.case("quaternion", "the quaternion has length 1, its scalar part first", COPY.format(35922))
 def quaternion(probe: SerialProbe) -> None:
-    found = struct.unpack("<I4d", solved(probe))[1:]
-    check(abs(sum(part * part for part in found) - 1.0) < 1e-9, "length 1", found)
+    components = struct.unpack("<I4d", solved(probe))[1:]
+    check(abs(sum(part * part for part in components) - 1.0) < 1e-9, "length 1", components)
     truth = probe.truth() if probe.truth is not None else None
     if truth is not None:
         x, y, z, w = truth
         # A(q) is the conjugate of the rotation of vectors
-        product = abs(w * found[0] - x * found[1] - y * found[2] - z * found[3])
+        product = abs(w * components[0] - x * components[1] - y * components[2] - z * components[3])
         check(
             product > 1.0 - 1e-5,
             f"scalar part {w:.6f} first, then {-x:.6f} {-y:.6f} {-z:.6f}, or all negative",
-            found,
+            components,
         )
 
 
