@@ -130,7 +130,6 @@ class Emulator:
             for head in run.heads:
                 events = scenario.prepare(head, run.truth if head.number == 1 else None)
                 head.device.scheduler.add(events)
-                head.foreseen += scenario.skies
         if options.control != "off" or options.console is not None:
             self.control = ControlServer(run, self.ended.set, options.control_token)
             if options.control != "off":

@@ -41,7 +41,7 @@ from starhil.emulator.sensor.pipeline.precompile import start_helper
 from starhil.emulator.sensor.pipeline.preview import make_preview
 from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starhil.emulator.sensor.renderer import Frame, Renderer, frame_without_truth
-from starhil.emulator.sensor.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
+from starhil.emulator.sensor.sky.objects import SkyObjects
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.simulation.guard import one_line
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
@@ -62,13 +62,6 @@ STARS_SENT: Final = 16
 
 DOWNLOAD_BITS: Final = 8
 """Bits per pixel of an image for download."""
-
-_WARM_UP_BODIES: Final = SkyObjects(
-    sun=SunGlare(0.0, 80.0),
-    moon=Moon(90.0, 80.0),
-    earth=EarthLimb(180.0, 20.0, sun_ra_deg=0.0, sun_dec_deg=0.0),
-)
-"""Bodies in and near the field of the identity attitude."""
 
 _WARM_UP_EXPOSURE_S: Final = 1.0
 """Exposure in which a dim sensor too sees enough stars to follow their trails, seconds."""
@@ -156,9 +149,6 @@ class Pipeline:
         for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):
             turning = TruthState(attitude, np.array(rate))
             self._process_frame(replace(request, truth=turning, predicted=predicted))
-        if self._sky.by_date:
-            for earth in (_WARM_UP_BODIES.earth, EarthLimb(180.0, 80.0, radius_deg=5.0)):
-                self._renderer.render(Attitude.identity(), objects=replace(_WARM_UP_BODIES, earth=earth))
         self._last = None
         gc.enable()
 
@@ -169,8 +159,8 @@ class Pipeline:
         try:
             if isinstance(request, IndexRequest):
                 self._identifiers.build(self._identifier_setup(request))
-                for rehearsal in request.rehearsals:
-                    self._rehearse(rehearsal)
+                if request.rehearsal is not None:
+                    self._rehearse(request.rehearsal)
                 return IndexReady()
             if isinstance(request, ImageRequest):
                 return self._scaled_image(request)
@@ -181,7 +171,7 @@ class Pipeline:
             return Failure(f"pipeline: internal error: {one_line(error)}")
 
     def _rehearse(self, request: FrameRequest) -> None:
-        """Take a frame that does not count: as it is, and with the bodies of its sky in the field.
+        """Take a frame that does not count.
 
         Only `geometric` keeps nothing from frame to frame, so that only it identifies stars in them.
         """
@@ -193,15 +183,6 @@ class Pipeline:
                 self._process_frame(replace(request, predicted=predicted))
         else:
             self.detections(request)
-        truth = request.truth
-        objects = self._sky.view(truth.unix_s, None, None, request.faults).objects
-        placed = {
-            name: getattr(_WARM_UP_BODIES, name)
-            for name in ("sun", "moon", "earth")
-            if getattr(objects, name)
-        }
-        if placed:
-            self._renderer.render(Attitude.identity(), objects=replace(objects, **placed))
         self._last = last
 
     def _process_frame(self, request: FrameRequest) -> FrameResult:
@@ -214,25 +195,25 @@ class Pipeline:
         if not request.solve:
             preview = self._preview(exposure, sensor) if request.preview else None
             return FrameResult(request.index, solved=False, render_s=rendered - begin, preview=preview)
-        found = self._detect(exposure, request, sensor)
+        detections = self._detect(exposure, request, sensor)
         detected = time.perf_counter()
         identifier, current = self._identifiers.get(self._identifier_setup(request))
-        solution = self._solve(identifier, found, request)
+        solution = self._solve(identifier, detections, request)
         solved = time.perf_counter()
         times = (begin, rendered, detected, solved)
-        result = self._frame_result(request, sensor, found, solution, identifier, times)
+        result = self._frame_result(request, sensor, detections, solution, identifier, times)
         if exposure.frame is not None:
             stars = exposure.frame.stars
-            seen = stars_seen(stars.xy_px[stars.visible], found.xy_px) if exposure.in_field else 0
+            seen = stars_seen(stars.xy_px[stars.visible], detections.xy_px) if exposure.in_field else 0
             enough = seen >= request.settings.min_stars_matched
             result = with_bodies(result, exposure.in_field, enough_stars=enough)
             if solution.features is not None and exposure.frame.objects is not None:
-                false = near_any(found.xy_px, exposure.frame.objects.false_xy_px)
+                false = near_any(detections.xy_px, exposure.frame.objects.false_xy_px)
                 removed = list(solution.features.removed_index)
                 counts = int(np.count_nonzero(false)), int(np.count_nonzero(false[removed]))
                 result = replace(result, false_detected=counts[0], false_removed=counts[1])
         if request.preview:
-            result = replace(result, preview=self._preview(exposure, sensor, found, solution))
+            result = replace(result, preview=self._preview(exposure, sensor, detections, solution))
         return result if current else replace(result, index_pending=True)
 
     def detections(self, request: FrameRequest) -> Detections:
@@ -244,9 +225,9 @@ class Pipeline:
         """Return the star identifier for the parameters of a request."""
         return self._identifiers.build(self._identifier_setup(request))
 
-    def solution(self, found: Detections, request: FrameRequest) -> Solution:
+    def solution(self, detections: Detections, request: FrameRequest) -> Solution:
         """Identify detections with the parameters of a request."""
-        return self._solve(self.identifier(request), found, request)
+        return self._solve(self.identifier(request), detections, request)
 
     def _detect(self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel) -> Detections:
         if self.images is None:
@@ -259,12 +240,12 @@ class Pipeline:
         self,
         exposure: _Exposure,
         sensor: SensorModel,
-        found: Detections | None = None,
+        detections: Detections | None = None,
         solution: Solution | None = None,
     ) -> Preview:
         """Return the preview of an image; without truth if the image was not rendered."""
         frame = exposure.frame or frame_without_truth(exposure.image, exposure.index)
-        return make_preview(frame, self.camera, sensor, exposure.objects, found, solution)
+        return make_preview(frame, self.camera, sensor, exposure.objects, detections, solution)
 
     def _expose(self, request: FrameRequest) -> _Exposure:
         """Take the next image from its source, or render it."""
@@ -302,11 +283,11 @@ class Pipeline:
         temperature = self._sensor.temperature_c if request.temperature_c is None else request.temperature_c
         return self._dark.subtracted(image, request.exposure_s, request.gain, temperature)
 
-    def _solve(self, identifier: StarIdentifier, found: Detections, request: FrameRequest) -> Solution:
+    def _solve(self, identifier: StarIdentifier, detections: Detections, request: FrameRequest) -> Solution:
         settings = request.settings
-        chosen = slice(0, settings.max_stars_matched if self._setup.algorithm == "geometric" else None)
-        xy, flux = found.xy_px[chosen], found.flux[chosen] / request.exposure_s
-        errors = found.position_errors[chosen]
+        brightest = slice(0, settings.max_stars_matched if self._setup.algorithm == "geometric" else None)
+        xy, flux = detections.xy_px[brightest], detections.flux[brightest] / request.exposure_s
+        errors = detections.position_errors[brightest]
         if request.predicted is None:
             solution = identifier.identify(xy, flux, errors, observer_velocity=request.observer_velocity)
         else:
@@ -371,7 +352,7 @@ class Pipeline:
         self,
         request: FrameRequest,
         sensor: SensorModel,
-        found: Detections,
+        detections: Detections,
         solution: Solution,
         identifier: StarIdentifier,
         times: tuple[float, float, float, float],
@@ -380,16 +361,16 @@ class Pipeline:
         begin, rendered, detected, solved = times
         zero_e = sensor.zero_magnitude_e_s * sensor.exposure_s
         camera = _camera_of(solution, identifier)
-        measured = camera.back_project(found.xy_px[solution.detection_index])
+        measured = camera.back_project(detections.xy_px[solution.detection_index])
         modelled = identifier.catalog.vectors[solution.catalog_index]
         stars = sorted(
             (
                 MatchedStar(
                     hip=int(hip),
-                    x=float(found.xy_px[row, 0]),
-                    y=float(found.xy_px[row, 1]),
-                    magnitude=-2.5 * math.log10(max(float(found.flux[row]), 1.0) / zero_e),
-                    snr=float(found.flux[row] / found.flux_sigma[row]),
+                    x=float(detections.xy_px[row, 0]),
+                    y=float(detections.xy_px[row, 1]),
+                    magnitude=-2.5 * math.log10(max(float(detections.flux[row]), 1.0) / zero_e),
+                    snr=float(detections.flux[row] / detections.flux_sigma[row]),
                     vector=as_triple(direction),
                     icrs=as_triple(icrs),
                 )
@@ -401,7 +382,7 @@ class Pipeline:
         )
         valid = solution.valid
         x, y, z, w = solution.quaternion_xyzw.tolist() if valid else (0.0, 0.0, 0.0, 0.0)
-        reason = solution.reason.value if found.searchable else "detection_failed"
+        reason = solution.reason.value if detections.searchable else "detection_failed"
         rate = solution.rate_rad_s
         return FrameResult(
             index=request.index,
@@ -412,15 +393,15 @@ class Pipeline:
             sigma_cross_arcsec=solution.cross_boresight_sigma_arcsec if valid else 0.0,
             sigma_roll_arcsec=solution.roll_sigma_arcsec if valid else 0.0,
             rate_rad_s=None if rate is None else (float(rate[0]), float(rate[1]), float(rate[2])),
-            detected=len(found.flux),
-            refused=found.rejected,
+            detected=len(detections.flux),
+            refused=detections.rejected,
             matched=solution.star_count,
             stars=tuple(stars[:STARS_SENT]),
             probability_false=solution.probability_false if valid else 1.0,
             rms_px=solution.rms_px if valid and solution.star_count else 0.0,
             features=solution.features,
-            background_dn=float(found.background),
-            noise_dn=float(found.noise),
+            background_dn=float(detections.background),
+            noise_dn=float(detections.noise),
             render_s=rendered - begin,
             detect_s=detected - rendered,
             identify_s=solved - detected,
