@@ -62,14 +62,11 @@ class Glare:
 
     def add_to(self, light: Image, directions: Image) -> None:
         """Add it to the light (h, w) of pixels in directions (3, h, w), in place."""
-        chord2 = np.full_like(light, self.soft**2)
-        for plane, towards in zip(directions, self.direction.tolist(), strict=True):
-            offset = plane - towards
-            offset *= offset
-            chord2 += offset
+        chord2 = scalar_products(directions, -2.0 * self.direction)
+        chord2 += np.float32(2.0 + self.soft**2)
         if self.cube:
             chord2 *= np.sqrt(chord2)
-        light += self.strength / chord2
+        light += np.float32(self.strength) / chord2
 
 
 @dataclass(frozen=True)

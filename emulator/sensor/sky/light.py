@@ -48,8 +48,8 @@ _SPOT_SIGMAS: Final = 2.0
 _GLOW_HEIGHTS: Final = 20.0
 """Heights of the atmosphere above the limb up to which it glows."""
 
-_NODES_PER_HEIGHT: Final = 64
-"""Nodes of the table of the glow, which is interpolated within 3·10⁻⁵ of the disc's brightness."""
+_LIMB_STEPS: Final = 1024
+"""Steps of the table of the limb, in which light is interpolated."""
 
 _GRID_STEP: Final = 8
 """Pixels between the points that are examined for the part of an image that shows a body."""
@@ -175,7 +175,7 @@ class AreaPainter:
         ]
         if earth is not None and self._in_field(earth, self._reach_rad(earth), attitude):
             patches += self._earth_patch(earth, attitude)
-        covers = [self._obstruction_transmission(obstruction) for obstruction in objects.obstructions]
+        covers = [_transmission_of(obstruction, *self._size) for obstruction in objects.obstructions]
         if objects.blank:
             covers.append(np.zeros(self._size[::-1], dtype=np.float32))
         everything = (0, self._camera.height, 0, self._camera.width)
@@ -270,43 +270,51 @@ class AreaPainter:
         sun = None if earth.sun_direction is None else attitude.to_sensor(earth.sun_direction)
         behind = one if sun is None else np.float32(-float(distance) * sum(nadir * sun))
         full = np.float32(self._earthlight(earth))
-        cosines, shares, glows = self._limb(earth)
+        end, edge, step, limb_of = self._limb(earth)
         for rows in row_blocks(0, bottom - top, right - left):
             directions = self._directions[:, top + rows.start : top + rows.stop, left:right]
             cosine = scalar_products(directions, nadir)
-            shown = cosine >= np.float32(cosines[0])
-            if not shown.any():
+            if not (cosine >= end).any():
                 continue
             shade = np.full_like(cosine, behind)
             if sun is not None:
-                depth = one - cosine * cosine
-                depth *= -distance * distance
+                depth = cosine * cosine
+                depth -= one
+                depth *= distance * distance
                 depth += one
                 along = distance * cosine
                 along -= np.sqrt(np.maximum(depth, zero, out=depth))
                 along *= scalar_products(directions, sun)
                 shade += along
-            np.clip(shade, zero, one, out=shade)
+                np.clip(shade, zero, one, out=shade)
             shade *= full
-            inside = cosine >= np.float32(cosines[-1])
+            inside = cosine >= edge
             light[rows] = np.where(inside, shade, zero)
-            passed[rows] = np.where(inside, zero, one)
-            limb = shown & ~inside
-            places = cosine[limb].astype(np.float64)
-            light[rows][limb] = shade[limb] * np.interp(places, cosines, glows).astype(np.float32)
-            passed[rows][limb] = np.interp(places, cosines, shares)
+            passed[rows] = ~inside
+            limb = np.flatnonzero((cosine >= end) & ~inside)
+            place = (cosine.ravel()[limb] - end) / step
+            node = place.astype(np.int64)
+            place -= node
+            lower, upper = limb_of[:, node], limb_of[:, node + 1]
+            share, glow = lower + place * (upper - lower)
+            passed[rows].reshape(-1)[limb] = share
+            light[rows].reshape(-1)[limb] = shade.ravel()[limb] * glow
         return [Patch(box, light, passed)]
 
-    def _limb(self, earth: EarthLimb) -> tuple[Array, Array, Array]:
-        """Return cosines (n,) of angles from the Earth's centre, from the end of the glow to the disc.
+    def _limb(self, earth: EarthLimb) -> tuple[np.float32, np.float32, np.float32, Image]:
+        """Return a table (2, n) of the limb by the cosine of the angle from the Earth's centre.
 
-        And for each the share of light that passes, and the brightness relative to the disc's.
+        It has the share of light that passes, and the brightness relative to the disc's, at equal steps of the cosine from the end of the
+        glow to the edge of the disc, which come first, with the step.
         """
-        heights = np.arange(int(_GLOW_HEIGHTS) * _NODES_PER_HEIGHT, -1, -1) / _NODES_PER_HEIGHT
-        angles = earth.radius_rad + heights * self._atmosphere_rad(earth)
-        heights, angles = heights[angles <= math.pi], angles[angles <= math.pi]
-        cosines = np.array([math.cos(angle) for angle in angles])
-        return cosines, np.minimum(heights, 1.0), np.array([math.exp(-height) for height in heights])
+        height_rad = self._atmosphere_rad(earth)
+        end = math.cos(min(earth.radius_rad + _GLOW_HEIGHTS * height_rad, math.pi))
+        step = (math.cos(earth.radius_rad) - end) / _LIMB_STEPS
+        angles = [math.acos(end + k * step) for k in range(_LIMB_STEPS)]
+        heights = [*((angle - earth.radius_rad) / height_rad for angle in angles), 0.0, 0.0]
+        table = [[min(height, 1.0) for height in heights], [math.exp(-height) for height in heights]]
+        edge = np.float32(end + _LIMB_STEPS * step)
+        return np.float32(end), edge, np.float32(step), np.array(table, dtype=np.float32)
 
     def _atmosphere_rad(self, earth: EarthLimb) -> float:
         """Return the angle over which the limb fades: the atmosphere's, but at least the width of a spot."""
@@ -317,25 +325,26 @@ class AreaPainter:
         """Return the angle from the Earth's centre to which the glow of its limb reaches."""
         return earth.radius_rad + _GLOW_HEIGHTS * self._atmosphere_rad(earth)
 
-    def _obstruction_transmission(self, obstruction: Obstruction) -> Image:
-        """Return the transmission (h, w) of an obstruction."""
-        import cv2
 
-        height, width = self._camera.height, self._camera.width
-        if obstruction.polygon_px:
-            cover = np.ones((height, width), dtype=np.float32)
-            corners = np.round(np.array(obstruction.polygon_px) * 16.0).astype(np.int32)
-            cv2.fillPoly(cover, [corners], 0.0, cv2.LINE_8, 4)
-        else:
-            angle = math.radians(obstruction.angle_deg)
-            x, y = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
-            along = (math.cos(angle) * x)[None, :] + (math.sin(angle) * y)[:, None]
-            edge = np.quantile(along, 1.0 - obstruction.share)
-            partial = 0.0 < obstruction.share < 1.0
-            cover = (along <= edge if partial else np.full_like(along, obstruction.share == 0.0)).astype(
-                np.float32
-            )
-        if obstruction.softness_px <= 0.0:
-            return cover
-        soft = cv2.GaussianBlur(cover, (0, 0), obstruction.softness_px, borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(soft, dtype=np.float32)
+@lru_cache(maxsize=4)
+def _transmission_of(obstruction: Obstruction, width: int, height: int) -> Image:
+    """Return the transmission (h, w) of an obstruction."""
+    import cv2
+
+    if obstruction.polygon_px:
+        cover = np.ones((height, width), dtype=np.float32)
+        corners = np.round(np.array(obstruction.polygon_px) * 16.0).astype(np.int32)
+        cv2.fillPoly(cover, [corners], 0.0, cv2.LINE_8, 4)
+    else:
+        angle = math.radians(obstruction.angle_deg)
+        x, y = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
+        along = (math.cos(angle) * x)[None, :] + (math.sin(angle) * y)[:, None]
+        edge = np.quantile(along, 1.0 - obstruction.share)
+        partial = 0.0 < obstruction.share < 1.0
+        cover = (along <= edge if partial else np.full_like(along, obstruction.share == 0.0)).astype(
+            np.float32
+        )
+    if obstruction.softness_px <= 0.0:
+        return cover
+    soft = cv2.GaussianBlur(cover, (0, 0), obstruction.softness_px, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(soft, dtype=np.float32)

@@ -147,7 +147,7 @@ def test_the_earth_is_a_sphere_with_an_atmosphere(radius_deg: float, sun: tuple[
 
 
 def test_glare_around_a_source_in_the_field_matches_a_computation_per_pixel(renderer: Renderer) -> None:
-    """Within 0.01 % of strength/(chord² + softness²) in every pixel."""
+    """Within 0.1 % of strength/(chord² + softness²) in every pixel."""
     camera, moon = DEFAULT_CAMERA, Moon(80.0, 2.0, magnitude=-12.7)
     light = AreaPainter(camera, renderer.sensor.zero_magnitude_e_s, 0.8).paint(SkyObjects(moon=moon), ORION)
     zero = np.zeros((camera.height, camera.width), dtype=np.float32)
@@ -159,7 +159,7 @@ def test_glare_around_a_source_in_the_field_matches_a_computation_per_pixel(rend
     total = renderer.sensor.electrons(-12.7, 0.2) * moon.glare_share * camera.pixel_scale_rad**2
     expected = total / (2.0 * np.pi * np.log(100.0)) / (chord2 + np.radians(0.3) ** 2)
     outside = chord2 > np.radians(0.8) ** 2
-    np.testing.assert_allclose(mean[y.ravel(), x.ravel()][outside], expected[outside], rtol=1e-4)
+    np.testing.assert_allclose(mean[y.ravel(), x.ravel()][outside], expected[outside], rtol=1e-3)
 
 
 def test_a_straight_edge_covers_the_share_asked_for(renderer: Renderer) -> None:
