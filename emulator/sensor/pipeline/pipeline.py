@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, one_line
 from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.pipeline.binning import mean_over_squares
@@ -43,7 +43,6 @@ from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifiers, S
 from starhil.emulator.sensor.renderer import Frame, Renderer, frame_without_truth
 from starhil.emulator.sensor.sky.objects import SkyObjects
 from starhil.emulator.sensor.sky.view import Sky
-from starhil.emulator.simulation.guard import one_line
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.arrays import Array
 from starid.attitude import Attitude

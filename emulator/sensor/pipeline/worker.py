@@ -11,9 +11,9 @@ import sys
 from contextlib import suppress
 from typing import Any, Final
 
+from starhil.emulator.errors import one_line
 from starhil.emulator.sensor.pipeline.messages import LENGTH, Failure, with_length
 from starhil.emulator.sensor.pipeline.parent_death_signal import end_with_parent
-from starhil.emulator.simulation.guard import one_line
 
 NICE: Final = 5
 """Niceness of the worker, so that the links have priority on a busy machine."""
