@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from starhil.emulator.control.scenario import Scenario
 from starhil.emulator.device.device import Background, outcome
@@ -62,6 +62,9 @@ from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 from starhil.protocol.unit import check_runs_no_code
 from starid.errors import StaridError
+
+MAX_LINE: Final = 4_000_000
+"""Longest line of a tape, bytes: some times a request on the control channel, or what waits for a link."""
 
 Item = TypeVar("Item", bytes, CanFrame)
 
@@ -198,10 +201,14 @@ def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
     path = folder / EVENTS_FILE
     last_ns = 0
     with explained(f"replay {path}: cannot be read"), open_user_file(path) as file:
-        for number, line in enumerate(file, start=1):
+        for number, line in enumerate(iter(lambda: file.readline(MAX_LINE), b""), start=1):
+            where = f"{path}: line {number}"
+            if len(line) == MAX_LINE:
+                raise EmulatorError(
+                    f"replay {where}: longer than {MAX_LINE / 1e6:g} MB; the recording is damaged"
+                )
             if not line.endswith(b"\n"):
                 return  # the run was killed while it wrote
-            where = f"{path}: line {number}"
             entry = validated(Line, line, where).root
             if entry.ns < last_ns:
                 why = f"time {entry.ns} ns is before that of the entry above, {last_ns} ns; the recording is damaged"

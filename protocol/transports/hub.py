@@ -176,6 +176,8 @@ class _Client(TurnProtocol):
 
     def deliver(self, sender: _Client, lines: list[bytes]) -> int:
         """Send frames of another client as soon as there is room; return how many were dropped."""
+        if self._transport.is_closing():
+            return len(lines)
         if self._waiting.size or self._full or self._settle is not None:
             return self._waiting.put(sender, lines)
         self._transport.write(b"".join(lines))
@@ -187,11 +189,11 @@ class _Client(TurnProtocol):
         return self._waiting.size + self._transport.get_write_buffer_size()
 
     def _write_waiting(self) -> None:
-        while self._waiting.size and not self._full:
+        while self._waiting.size and not self._full and not self._transport.is_closing():
             self._transport.write(b"".join(self._waiting.take(WINDOW)))
 
     def _answer(self, text: str) -> None:
-        if self.backlog <= BACKLOG_LIMIT:
+        if self.backlog <= BACKLOG_LIMIT and not self._transport.is_closing():
             self._transport.write(f"< {text} >".encode())
 
     def _answer_error(self, text: str) -> None:
