@@ -17,6 +17,7 @@ from starhil.protocol.serial.stack import SerialStack
 from starhil.protocol.unit import load_unit
 from tests.emulator.conftest import FakePipeline
 from tests.emulator.runs import FakeImager
+from tests.patience import PATIENCE_S
 from tests.test_docs import blocks, programs, run
 
 PAGE = "your-unit.md"
@@ -112,7 +113,7 @@ def test_the_unit_of_the_page_streams_by_itself(tmp_path, monkeypatch):
     profile = Profile.model_validate({"unit": str(folder), "links": {"can": {"channel": "off"}}})
 
     def listen(port: str) -> bytes:
-        with serial.Serial(port, timeout=10.0) as line:
+        with serial.Serial(port, timeout=PATIENCE_S) as line:
             return line.read(400)
 
     async def read() -> bytes:

@@ -17,6 +17,7 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.protocol.files.bundled import find_unit
+from tests.patience import PATIENCE_S
 from tests.process.conftest import NO_IMAGES
 from tests.process.test_sessions import starhil
 
@@ -80,10 +81,10 @@ def test_safe_cases_change_nothing(tmp_path):
     )
     with EmulatorProcess(command) as emulator:
         port = emulator.ready["serial"]
-        with ObcClient.open(serial=port, timeout_s=5.0) as obc:
+        with ObcClient.open(serial=port, timeout_s=PATIENCE_S) as obc:
             before = {name: obc.telemetry(name) for name in rows}
         outcomes = conform(*chosen, "--serial", port, "--safe-only", *SLOW_MOTION)
-        with ObcClient.open(serial=port, timeout_s=5.0) as obc:
+        with ObcClient.open(serial=port, timeout_s=PATIENCE_S) as obc:
             after = {name: obc.telemetry(name) for name in rows}
             last = obc.telemetry("acknowledge")["last_telecommand"]
     assert len(outcomes) > 60

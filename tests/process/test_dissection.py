@@ -12,13 +12,13 @@ from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.unit import load_unit
 from tests.candump import read_candump
+from tests.patience import PATIENCE_S
 from tests.process.test_sessions import starhil
 from tests.protocol.export.dissection import dissect
 
 pytestmark = pytest.mark.process
 
 NODE = 44
-PATIENCE_S = 10.0
 TRIES = 10
 TIMED_OUT = 0x05040000
 BOOT_UP = 0

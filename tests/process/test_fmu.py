@@ -24,6 +24,7 @@ from scipy.stats import binom, chi2
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, installed_command
 from tests.emulator.cli.command_line import run_command_line
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
@@ -217,9 +218,9 @@ def tumbling(
         unit.slave.terminate()
 
 
-def gone(path: Path, within_s: float = 20.0) -> bool:
+def gone(path: Path) -> bool:
     """Whether a file vanishes in time, here the symbolic link of an emulator that ends."""
-    end = time.monotonic() + within_s
+    end = time.monotonic() + PATIENCE_S
     while path.is_symlink() and time.monotonic() < end:
         time.sleep(0.05)
     return not path.is_symlink()
@@ -233,7 +234,7 @@ def children(process: int, word: str) -> list[int]:
 
 def replies(step: Callable[[np.void], object], port: str) -> list[dict[str, object]]:
     """What an OBC reads on the serial line while a simulator steps."""
-    with ObcClient.open(serial=port, timeout_s=5.0) as obc:
+    with ObcClient.open(serial=port, timeout_s=PATIENCE_S) as obc:
         found = []
         for number, row in enumerate(tumble(6.0)):
             step(row)
@@ -356,7 +357,12 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
     )
     root = Path(__file__).parents[2]
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=False, timeout=120
+        [sys.executable, "-c", program],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == -signal.SIGKILL, done.stderr
     assert gone(link)
@@ -389,7 +395,7 @@ def test_the_process_rejects_the_values_of_another_version() -> None:
         command = [installed_command(), "fmu", "serve"]
         process = subprocess.Popen(command, stdin=theirs, stderr=subprocess.PIPE, text=True)
         ours.send(b"short")
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=PATIENCE_S)
     assert said == "starhil: fmu serve: the FMU is of another version of starhil; export it again\n"
     assert process.returncode != 0
 
@@ -514,6 +520,6 @@ def test_the_program_of_the_docs_prints_what_they_show(fmu3: Path, tmp_path: Pat
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
     assert done.stdout.splitlines()[-1:] == shown.splitlines(), done.stderr

@@ -9,6 +9,7 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.protocol.can.frame import CanFrame
+from tests.patience import PATIENCE_S
 from tests.process.reference import (
     ICD,
     UNANSWERED,
@@ -26,7 +27,6 @@ STRINGS = 10_000
 FRAMES = 10_000
 BATCH = 40
 """Strings that are sent at once: about 1 KiB, well below what a pty holds."""
-PATIENCE_S = 20.0
 MARK = 0x80
 """Request that ends a batch: identification."""
 

@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -16,10 +15,10 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
+from tests.patience import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
-PATIENCE_S = 240.0
 SESSION = "[[step]]\nread = 'identification'\n[[step]]\nwait_s = 600\n[[step]]\nread = 'device_status'\n"
 
 
@@ -121,7 +120,7 @@ def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_pa
         "from starhil.hil_tests.rig.emulator_process import emulator_command\n"
         f"child = subprocess.Popen(emulator_command(state_dir={str(tmp_path)!r}), stdout=subprocess.DEVNULL)\n"
         "print(child.pid, flush=True)\n"
-        "time.sleep(600)\n"
+        "time.sleep(1e6)\n"
     )
     with subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True) as parent:
         child = int(parent.stdout.readline())
@@ -130,12 +129,12 @@ def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_pa
 
 
 def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tmp_path):
-    control = tmp_path / "control"
+    control, reading = tmp_path / "control", tmp_path / "reading"
     text = (
         "import sys, time\n"
         "from starhil.emulator.cli.app import main\n"
         "from starhil.emulator.truth import config\n"
-        "config.read_truth_file = lambda *_: time.sleep(600.0)\n"
+        f"config.read_truth_file = lambda *_: (open({str(reading)!r}, 'w').close(), time.sleep(1e6))\n"
         f"sys.argv[1:] = ['run', 'demo', '--serial', 'off', '--can', 'off', '--control', 'unix:{control}']\n"
         "sys.exit(main())\n"
     )
@@ -145,17 +144,12 @@ def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tm
     ):  # ends by SIGTERM
         peer.connect(str(control))
         peer.sendall(b'{"do": "set_truth", "truth": {"kind": "file", "path": "/"}}\n')
-        peer.settimeout(0.5)
-        with pytest.raises(TimeoutError):  # it is being read
-            peer.recv(1)
+        wait_until(reading.exists, "the file is not read")
 
 
 def test_an_interrupted_start_ends_the_emulator():
-    process = EmulatorProcess([sys.executable, "-c", "import time; time.sleep(600)"])
-    main = threading.main_thread().ident  # the timer's own thread would not wake the one that waits
-    timer = threading.Timer(1.0, signal.pthread_kill, [main, signal.SIGINT])
-    timer.start()
+    text = "import os, signal, time; os.kill(os.getppid(), signal.SIGINT); time.sleep(600)"
+    process = EmulatorProcess([sys.executable, "-c", text])
     with pytest.raises(KeyboardInterrupt), process:
         pass
-    timer.join()
     assert not process.running

@@ -16,13 +16,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.patience import PATIENCE_S
 from tests.process.conftest import needs_vcan0
 from tests.test_docs import PAGES, UNASKED, TypedPage, assert_shown, dumped
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
-
-READY_WITHIN_S = 180.0
-PATIENCE_S = 30.0
 
 
 class Typed:
@@ -79,7 +77,7 @@ def running(line: str, environment: dict[str, str]) -> Iterator[Typed]:
 def emulator_and_dump(page: TypedPage, environment: dict[str, str]) -> Iterator[Typed]:
     """Type the lines that start the emulator and candump; give the dump."""
     with running(page.run, environment) as emulator:
-        assert emulator.next_line(READY_WITHIN_S).startswith("ready can=socketcan:vcan0 ")
+        assert emulator.next_line(PATIENCE_S).startswith("ready can=socketcan:vcan0 ")
         with running(page.candump, environment) as dump:
             with running("cangen vcan0 -g 20 -I 7FE", environment):
                 dump.skip_past("7FE")  # candump listens

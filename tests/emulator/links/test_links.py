@@ -25,6 +25,7 @@ from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Re
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.transports.serial import open_serial
 from tests.emulator.wire import Wire
+from tests.patience import PATIENCE_S
 from tests.process.reference import bodies_in
 from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
 
@@ -278,7 +279,7 @@ def test_the_acknowledge_of_a_reset_is_sent_in_its_turn(bench):
         boots = bench.device.boot_count
         bench.step(0.1)
         assert bench.device.boot_count == boots + 1
-        async with asyncio.timeout(10.0):
+        async with asyncio.timeout(PATIENCE_S):
             while len(bus.sent) < 9:  # eight of the telemetry, one of the acknowledge
                 await asyncio.sleep(0.001)
         assert CanId.unpack(bus.sent[-1].id).type == MessageType.TELECOMMAND_ACK
@@ -399,7 +400,7 @@ def test_a_flood_on_the_serial_line_leaves_the_loop_to_others_after_some_80_faul
                     socket.create_connection((address.hostname, address.port))
                 ).fileno()
             written = os.write(peer, b"\x1f\x7f\x80" * 1300)
-            async with asyncio.timeout(10.0):
+            async with asyncio.timeout(PATIENCE_S):
                 while counts[-1] < written // 3 - 1:
                     await asyncio.sleep(0)
                     counts.append(sum(bench.device.counters.faults.values()))

@@ -7,8 +7,8 @@ import pytest
 from starhil.emulator.profile import load_profile
 from starhil.emulator.run import Run
 from tests.emulator.runs import FirstHead, command
+from tests.patience import PATIENCE_S
 
-WITHIN_S = 60.0
 FRAMES = 3
 FEWER_STARS = {"limiting_magnitude": 3.0}
 LOST_IN_SPACE = "parameters.start_mode=lost_in_space"
@@ -25,11 +25,11 @@ def run(scenario, state_dir, clock="scaled:2", worker="thread"):
         try:
             await run.open()
             run.begin()
-            await asyncio.wait_for(run.ready(), WITHIN_S)
+            await asyncio.wait_for(run.ready(), PATIENCE_S)
             emulation = FirstHead(run)
             emulation.shots = []
             emulation.device.signals.frame_published.connect(emulation.shots.append)
-            return await asyncio.wait_for(scenario(emulation), WITHIN_S)
+            return await asyncio.wait_for(scenario(emulation), PATIENCE_S)
         finally:
             await run.close()
 

@@ -8,9 +8,9 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
 from tests.emulator.runs import CAMERA, FirstHead, command, read
 from tests.emulator.workers import ANSWERING, WORKER
+from tests.patience import PATIENCE_S
 from tests.protocol.transports.pairs import turns
 
-WITHIN_S = 20.0
 ENDS_AT_ONCE = ""
 ENDS_WHEN_READY = WORKER + f"send(PipelineReady({CAMERA}, 5, 0.0))\n"
 REJECTS = WORKER + "send(Failure('no catalogue'))\n"
@@ -42,8 +42,8 @@ def run(worker):
             try:
                 await run.open()
                 run.begin()
-                await asyncio.wait_for(run.ready(), WITHIN_S)
-                await asyncio.wait_for(scenario(FirstHead(run), process.started), WITHIN_S)
+                await asyncio.wait_for(run.ready(), PATIENCE_S)
+                await asyncio.wait_for(scenario(FirstHead(run), process.started), PATIENCE_S)
             finally:
                 await run.close()
 

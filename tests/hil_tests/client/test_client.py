@@ -22,11 +22,9 @@ from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.unit import load_unit
 from tests.hil_tests.fake_device import EDGE, FakeDevice, bmp_file
+from tests.patience import PATIENCE_S
 
-PATIENCE_S = 5.0
 TIMEOUT_S = 0.15
-PATIENCE_S = 20.0
-"""For requests that the device leaves unanswered."""
 LINKS = ["serial-a", "serial-b", "serial-c", "can"]
 
 

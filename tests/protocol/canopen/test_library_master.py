@@ -13,9 +13,9 @@ import pytest
 
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.eds import build_eds
+from tests.patience import PATIENCE_S
 
 FRAME = bytes(number * 7 & 0xFF for number in range(937 * 937))
-PATIENCE_S = 20.0
 BOOT_UP, OPERATIONAL = 0, 5
 """NMT states as in a heartbeat."""
 

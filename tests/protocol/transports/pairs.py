@@ -17,8 +17,8 @@ from starhil.protocol.transports.can import CanTransport, kernel_can_is_up, open
 from starhil.protocol.transports.hub import CanHub
 from starhil.protocol.transports.paced import SerialTransport
 from starhil.protocol.transports.serial import open_serial
+from tests.patience import PATIENCE_S
 
-DEADLINE_S = 10.0
 HAS_VCAN = kernel_can_is_up("vcan0")
 
 SERIAL_KINDS = ["pty and tty", "listen and socket"]
@@ -44,7 +44,7 @@ CAN_KINDS = [
 
 async def until(condition: Callable[[], bool]) -> None:
     """Wait until something is true; the deadline only ends a test that fails."""
-    async with asyncio.timeout(DEADLINE_S):
+    async with asyncio.timeout(PATIENCE_S):
         while not condition():
             await asyncio.sleep(0.002)
 

@@ -20,10 +20,10 @@ from starhil.emulator.sensor.pipeline.messages import (
 from starhil.emulator.sensor.pipeline.worker_process import WorkerThread
 from tests.emulator.runs import CAMERA
 from tests.emulator.workers import ANSWERING, WORKER
+from tests.patience import PATIENCE_S
 from tests.protocol.transports.pairs import turns
 
 SETUP = pipeline_setup(Profile())
-WITHIN_S = 20.0
 REQUEST = ImageRequest(64)
 
 
@@ -64,8 +64,8 @@ def run(imager_of, scenario):
     async def whole():
         imager = imager_of()
         try:
-            await asyncio.wait_for(imager.start(), WITHIN_S)
-            await asyncio.wait_for(scenario(imager), WITHIN_S)
+            await asyncio.wait_for(imager.start(), PATIENCE_S)
+            await asyncio.wait_for(scenario(imager), PATIENCE_S)
         finally:
             await imager.close()
 
@@ -178,7 +178,7 @@ def test_a_start_that_fails_raises_once_and_is_no_loss(worker, program):
         imager.ended.connect(losses.append)
         try:
             with pytest.raises(EmulatorError, match=r"no catalogue|pipeline worker"):
-                await asyncio.wait_for(imager.start(), WITHIN_S)
+                await asyncio.wait_for(imager.start(), PATIENCE_S)
             await turns()
         finally:
             await imager.close()
@@ -206,7 +206,7 @@ def test_a_thread_whose_pipeline_cannot_be_made_reports_it(monkeypatch):
         imager = WorkerClient(SETUP, WorkerThread())
         try:
             with pytest.raises(EmulatorError, match="ValueError: odd camera"):
-                await asyncio.wait_for(imager.start(), WITHIN_S)
+                await asyncio.wait_for(imager.start(), PATIENCE_S)
         finally:
             await imager.close()
 
