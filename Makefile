@@ -47,9 +47,27 @@ $(VENV)/.developer: pyproject.toml | $(VENV)/pyvenv.cfg
 demo: $(VENV)/.product
 	$(BIN)/python tools/demo.py --out out/demo
 
+# The tests in lanes, of which at most as many run at once as there are processors: none is starved. What mostly waits and is real to
+# the clock comes first and has the processor when it needs it; what computes gives way. BESIDE names targets that run among them.
+LANES := vcan0 processes emulator computing
+COMPUTING := tests/protocol tests/starid tests/conformance
+WAITING := tests/process tests/emulator/console/test_browser.py tests/emulator/console/test_bad_day.py
+lane-processes: TESTS := $(WAITING)
+lane-emulator: TESTS := tests $(addprefix --ignore=,$(WAITING) $(COMPUTING))
+lane-computing: TESTS := $(COMPUTING)
+lane-emulator lane-computing: PRIORITY := nice
+REPORTS := out/tests
 test: $(VENV)/.developer
 	-@tools/install_test_packages tests obc
-	@tools/test_in_lanes $(BIN)/python
+	@rm -rf $(REPORTS); mkdir -p $(REPORTS); for lane in $(LANES); do echo "ended without a report" >$(REPORTS)/$$lane.reason; done
+	@$(BIN)/starhil cache warm
+	@status=0; $(MAKE) --no-print-directory --jobs=$$(nproc) --keep-going --output-sync=target $(BESIDE) $(LANES:%=lane-%) || status=1; \
+		[ $$status = 0 ] && echo "all passed" || echo "some failed: see the lines FAILED and ERROR above"; \
+		$(BIN)/python tools/tier_table.py $(REPORTS); exit $$status
+lane-vcan0:
+	@REPORTS=$(REPORTS) nice tools/test_on_vcan $(BIN)/python
+lane-%:
+	@$(PRIORITY) $(BIN)/python -m pytest -m "not socketcan" --junit-xml=$(REPORTS)/$*.xml $(TESTS)
 
 # of `check`, beside the tests that start processes: what computes for long, or waits for the clock
 LONG := $(addprefix tests/,process fuzzing conformance test_docs.py hil_tests/endurance hil_tests/timing hil_tests/rig starid/kernels starid/lab) \

@@ -18,7 +18,7 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from tests.candump import parse_candump, read_candump
 from tests.patience import PATIENCE_S
-from tests.process.conftest import needs_vcan0
+from tests.process.conftest import NO_IMAGES, needs_vcan0
 from tests.process.test_sessions import starhil
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
@@ -33,7 +33,7 @@ def unit(tmp_path_factory):
         serial="off",
         can="auto",
         seed=1,
-        settings=["truth.attitude.roll_deg=30"],
+        settings=["truth.attitude.roll_deg=30", NO_IMAGES],
         state_dir=state,
         extra=["--canopen", "44"],
     )
@@ -188,7 +188,9 @@ def pty_pair():
 
 def test_an_slcan_adapter_on_a_tty(tmp_path):
     with pty_pair() as (kernel_end, device_end):
-        command = emulator_command(serial="off", can=f"slcan:{device_end}", state_dir=tmp_path / "state")
+        command = emulator_command(
+            serial="off", can=f"slcan:{device_end}", state_dir=tmp_path / "state", settings=[NO_IMAGES]
+        )
         with EmulatorProcess(command, ready_within_s=PATIENCE_S):
             daemon = subprocess.Popen([shutil.which("slcand"), "-F", "-S", "115200", kernel_end, "slcan0"])
             try:
