@@ -41,7 +41,7 @@ from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 DOCS = Path(__file__).parents[1] / "docs"
 UNASKED = {0x0CE60401, 0x185}

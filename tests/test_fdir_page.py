@@ -11,8 +11,8 @@ import pytest
 
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.telemetry_faults import EFFECTS, TelemetryFault
-from tests.patience import PATIENCE_S
 from tests.test_docs import DOCS, blocks
+from tests.waiting import PATIENCE_S
 
 PAGE = "fdir.md"
 

@@ -18,7 +18,7 @@ from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_com
 from starhil.hil_tests.session.script import load_script
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

@@ -17,8 +17,8 @@ from starhil.protocol.serial.stack import SerialStack
 from starhil.protocol.unit import load_unit
 from tests.emulator.conftest import FakePipeline
 from tests.emulator.runs import FakeImager
-from tests.patience import PATIENCE_S
 from tests.test_docs import blocks, programs, run
+from tests.waiting import PATIENCE_S
 
 PAGE = "your-unit.md"
 STREAMING = "A unit that streams by itself"

@@ -18,7 +18,7 @@ from starhil.protocol.transports import connections
 from starhil.protocol.transports.hub import CanHub
 from tests.emulator.console.pages import OPTIONS
 from tests.emulator.runs import Control
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 
 DESCRIPTORS = 128
 CONNECTIONS = 130
@@ -74,9 +74,7 @@ def view_port(emulation):
 
 async def until_full(caplog):
     """Wait until the limit of connections has been reached."""
-    async with asyncio.timeout(PATIENCE_S):
-        while "16 connections are open" not in caplog.text:
-            await asyncio.sleep(0.01)
+    await until(lambda: "16 connections are open" in caplog.text)
 
 
 async def answers(control):
@@ -184,18 +182,14 @@ def test_a_hub_rejects_clients_above_its_limit_and_serves_the_others(few_descrip
         assert await reader.readexactly(6) == b"< hi >"
 
         async def check():
-            async with asyncio.timeout(PATIENCE_S):
-                while len(hub.clients) < 16:
-                    await asyncio.sleep(0.01)
+            await until(lambda: len(hub.clients) >= 16)
             writer.write(b"< echo >")
             assert await asyncio.wait_for(reader.readexactly(8), PATIENCE_S) == b"< echo >"
             assert len(hub.clients) == 16
 
         try:
             await flooded(hub.port, "< open", check)
-            async with asyncio.timeout(PATIENCE_S):
-                while len(hub.clients) > 1:
-                    await asyncio.sleep(0.01)
+            await until(lambda: len(hub.clients) <= 1)
         finally:
             writer.close()
             await hub.close()

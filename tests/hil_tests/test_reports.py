@@ -19,7 +19,7 @@ from starhil.hil_tests.reports import write_report
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess
 from starhil.hil_tests.rig.private_can_bus import hub_thread
 from starhil.hil_tests.session import session_run
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 DIES = "import sys; print('ready can={}', flush=True); print('no more sky', file=sys.stderr); sys.exit(7)"
 

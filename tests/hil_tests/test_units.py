@@ -13,8 +13,8 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Reply, ReplyKind
 from starhil.protocol.serial.stack import SerialStack
 from starhil.protocol.unit import load_unit
-from tests.patience import PATIENCE_S
 from tests.user_units import STREAM, packets, written
+from tests.waiting import PATIENCE_S
 
 DEFINITION = """
 [unit]

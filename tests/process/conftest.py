@@ -8,7 +8,7 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from starhil.protocol.transports.can import kernel_can_is_up
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 FAST_BAUD = 921600
 NO_IMAGES = "run.worker=error_model"

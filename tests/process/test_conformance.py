@@ -17,9 +17,9 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.protocol.files.bundled import find_unit
-from tests.patience import PATIENCE_S
 from tests.process.conftest import NO_IMAGES
 from tests.process.test_sessions import starhil
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 

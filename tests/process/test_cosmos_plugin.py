@@ -13,10 +13,10 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.protocol.icd.quoting import cosmos_state
 from starhil.protocol.unit import load_unit
-from tests.patience import PATIENCE_S
 from tests.protocol.export.cosmos_plugin import Plugin
 from tests.protocol.export.test_export import same
 from tests.protocol.serial.composed_links import CUBESTAR
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 

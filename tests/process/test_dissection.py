@@ -12,9 +12,9 @@ from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.unit import load_unit
 from tests.candump import read_candump
-from tests.patience import PATIENCE_S
 from tests.process.test_sessions import starhil
 from tests.protocol.export.dissection import dissect
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 

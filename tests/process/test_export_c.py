@@ -15,10 +15,10 @@ from starhil.protocol.export.packets import key_of
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
-from tests.patience import PATIENCE_S
 from tests.protocol.export.c_driver import COMPILER, FLAGS, CDriver, c_words, hex_or_none
 from tests.protocol.export.test_c import KINDS
 from tests.protocol.serial.composed_links import CUBESTAR
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 

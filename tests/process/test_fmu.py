@@ -10,7 +10,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import islice
@@ -24,7 +23,7 @@ from scipy.stats import binom, chi2
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, installed_command
 from tests.emulator.cli.command_line import run_command_line
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
@@ -218,14 +217,6 @@ def tumbling(
         unit.slave.terminate()
 
 
-def gone(path: Path) -> bool:
-    """Whether a file vanishes in time, here the symbolic link of an emulator that ends."""
-    end = time.monotonic() + PATIENCE_S
-    while path.is_symlink() and time.monotonic() < end:
-        time.sleep(0.05)
-    return not path.is_symlink()
-
-
 def children(process: int, word: str) -> list[int]:
     """The children of a process that have a word in their command line."""
     pids = Path(f"/proc/{process}/task/{process}/children").read_text().split()
@@ -252,7 +243,7 @@ def test_an_obc_reads_the_same_as_beside_a_simulator_that_speaks_to_the_feed(
         assert unit.get("ready").startswith("ready truth=tcp:")
         by_fmu = replies(unit.step, str(link))
         unit.slave.terminate()
-        assert gone(link)
+        wait_until(lambda: not link.is_symlink())
     command = emulator_command(
         profile=str(fmu3.parent / QUICK),
         serial="auto",
@@ -365,7 +356,7 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
         timeout=PATIENCE_S,
     )
     assert done.returncode == -signal.SIGKILL, done.stderr
-    assert gone(link)
+    wait_until(lambda: not link.is_symlink())
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.protocol.can.frame import CanFrame
-from tests.patience import PATIENCE_S
 from tests.process.reference import (
     ICD,
     UNANSWERED,
@@ -20,6 +19,7 @@ from tests.process.reference import (
     is_dangerous,
     requests_in,
 )
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 

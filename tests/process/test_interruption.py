@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -15,7 +14,7 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
@@ -55,13 +54,6 @@ def alive(pid: int) -> bool:
         return False
 
 
-def wait_until(condition, what: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)
-
-
 def interrupt(words: list, number: signal.Signals, folder: Path) -> int:
     """Start a command, send it a signal once a line of its run is out.
 
@@ -77,7 +69,7 @@ def interrupt(words: list, number: signal.Signals, folder: Path) -> int:
         process.send_signal(number)
         process.wait(timeout=PATIENCE_S)
         process.stdout.close()
-    wait_until(lambda: not any(alive(pid) for pid in family), f"{family} outlived {number.name}")
+    wait_until(lambda: not any(alive(pid) for pid in family))
     return process.returncode
 
 
@@ -125,7 +117,7 @@ def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_pa
     with subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True) as parent:
         child = int(parent.stdout.readline())
         parent.kill()
-    wait_until(lambda: not alive(child), "the emulator outlived its parent")
+    wait_until(lambda: not alive(child))
 
 
 def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tmp_path):
@@ -144,7 +136,7 @@ def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tm
     ):  # ends by SIGTERM
         peer.connect(str(control))
         peer.sendall(b'{"do": "set_truth", "truth": {"kind": "file", "path": "/"}}\n')
-        wait_until(reading.exists, "the file is not read")
+        wait_until(reading.exists)
 
 
 def test_an_interrupted_start_ends_the_emulator():

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 

@@ -8,7 +8,6 @@ import os
 import random
 import re
 import signal
-import time
 import tty
 from concurrent.futures import ThreadPoolExecutor
 
@@ -21,20 +20,13 @@ from starhil.hil_tests.errors import BenchError, DeviceError
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import hub_thread
 from starhil.protocol.can.frame import CanFrame
-from tests.patience import PATIENCE_S
 from tests.process.conftest import FAST_BAUD, NO_IMAGES
 from tests.process.reference import frame_request
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
 MEMORY_LIMIT = 500e6
-
-
-def wait_until(condition) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come about in time"
-        time.sleep(0.05)
 
 
 def answers(client: ObcClient, row: str = "identification") -> bool:

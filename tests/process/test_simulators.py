@@ -18,7 +18,7 @@ from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_com
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.truth.simulators import blocks_of_42
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 

@@ -10,6 +10,7 @@ import subprocess
 import threading
 import time
 import tty
+from pathlib import Path
 
 import can
 import pytest
@@ -17,9 +18,9 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from tests.candump import parse_candump, read_candump
-from tests.patience import PATIENCE_S
 from tests.process.conftest import NO_IMAGES, needs_vcan0
 from tests.process.test_sessions import starhil
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
 
@@ -69,9 +70,7 @@ def dump():
         return [str(frame) for frame in frames if frame.extended]
 
     def _seen(count: int) -> list[str]:
-        deadline = time.monotonic() + PATIENCE_S
-        while len(_frames()) < count and time.monotonic() < deadline:
-            time.sleep(0.02)
+        wait_until(lambda: len(_frames()) >= count)
         return _frames()
 
     yield _seen
@@ -194,10 +193,7 @@ def test_an_slcan_adapter_on_a_tty(tmp_path):
         with EmulatorProcess(command, ready_within_s=PATIENCE_S):
             daemon = subprocess.Popen([shutil.which("slcand"), "-F", "-S", "115200", kernel_end, "slcan0"])
             try:
-                deadline = time.monotonic() + PATIENCE_S
-                while not os.path.exists("/sys/class/net/slcan0"):  # noqa: PTH110 -- one look
-                    assert time.monotonic() < deadline
-                    time.sleep(0.05)
+                wait_until(Path("/sys/class/net/slcan0").exists)
                 subprocess.run([shutil.which("ip"), "link", "set", "slcan0", "up"], check=True)
                 with ObcClient.open(can="slcan0", timeout_s=PATIENCE_S) as obc:
                     assert obc.telemetry("identification")["interface_version"] == 1

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.patience import PATIENCE_S
 from tests.process.conftest import needs_vcan0
 from tests.test_docs import NO_IMAGES, PAGES, UNASKED, TypedPage, assert_shown, dumped
+from tests.waiting import PATIENCE_S
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
 

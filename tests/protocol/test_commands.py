@@ -14,7 +14,7 @@ import pytest
 from starhil.protocol.unit import load_unit
 from tests.candump import read_candump
 from tests.emulator.cli.command_line import run_command_line
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 STARHIL = [sys.executable, "-c", "from starhil.emulator.cli.app import main; main()"]
 

@@ -20,7 +20,7 @@ from starid.cli import command_line
 from starid.cli.output import show_every_character
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.workers import WORKER
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 PROGRAM = [sys.executable, "-c", "from starhil.emulator.cli import main; main()"]
 WRITTEN = {"--output", "--junit", "--html", "--truth-log"}

@@ -15,7 +15,7 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 AXE = (

@@ -10,7 +10,7 @@ import numpy as np
 from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.console.history import COLUMNS, TIMES
 from starhil.emulator.launch import ConsoleOptions, RunOptions
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 OPTIONS = RunOptions(control="auto", console=ConsoleOptions(ConsoleClient, view="auto"))
 

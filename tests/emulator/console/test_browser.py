@@ -18,7 +18,7 @@ from tests.emulator.console.browser import (
     opened,
     wait_for_text,
 )
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 UPDATE_RATE_HZ = 5
 

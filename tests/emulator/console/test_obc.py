@@ -13,7 +13,7 @@ from starhil.hil_tests.session.script import load_script
 from starhil.protocol.unit import load_unit
 from tests.candump import parse_candump
 from tests.emulator.console.pages import OPTIONS, Page
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 LINKS_OFF = {"serial": {"port": "off"}, "can": {"channel": "off"}}
 

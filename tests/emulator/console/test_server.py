@@ -23,8 +23,7 @@ from starhil.hil_tests.rig.console_feed import RunFeed
 from tests.emulator.conftest import PREVIEW
 from tests.emulator.console.pages import ALONG_X, OPTIONS, Page, column
 from tests.emulator.runs import command, read
-from tests.patience import PATIENCE_S
-from tests.protocol.transports.pairs import until
+from tests.waiting import until
 
 
 @pytest.mark.parametrize(
@@ -180,9 +179,7 @@ def test_previews_are_made_only_while_a_page_shows_images(run):
             await emulation.stepper.step(2.0)
             assert all(request.preview for request in run.pipeline.frames[before + 1 :])
             await page.until(lambda: page.frames)
-        async with asyncio.timeout(PATIENCE_S):
-            while emulation.imager.watchers:
-                await asyncio.sleep(0.01)
+        await until(lambda: not emulation.imager.watchers)
         seen = len(run.pipeline.frames)
         await emulation.stepper.step(2.0)
         assert len(run.pipeline.frames) > seen

@@ -15,7 +15,7 @@ from starhil.emulator.run.truth_log import COLUMNS
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.file import read_truth_file
 from tests.emulator.runs import Control, command
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 REQUESTS = 10_000
 

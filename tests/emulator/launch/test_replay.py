@@ -25,7 +25,7 @@ from starhil.hil_tests.errors import BenchError
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import CAMERA, Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 
 PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 5.0}
 ROUNDS = 10
@@ -196,9 +196,7 @@ def test_a_unit_without_dialects_is_repeated_at_its_own_bit_rate(record):
 def test_a_simulator_is_not_needed_for_the_replay(record, clock):
     async def scenario(emulation, _line):
         await Stub42(blocks_of_42(31)).connect(int(emulation.ready_fields["truth"].rpartition(":")[2]))
-        async with asyncio.timeout(PATIENCE_S):
-            while emulation.device.cycle.published < 3:
-                await asyncio.sleep(0.02)
+        await until(lambda: emulation.device.cycle.published >= 3)
 
     folder = record(scenario, clock=clock, truth={"kind": "42", "role": "server", "port": 0})
     assert report_of(folder).differences == []
@@ -220,9 +218,7 @@ def test_a_run_whose_pipeline_dies_and_is_restarted_is_repeated(record, clock):
         imager._handle = lambda _request: PipelineEnded("killed")
         imager.ended.emit("killed")
         assert device.modes.mode.value == "error"
-        async with asyncio.timeout(PATIENCE_S):
-            while not device.warm:
-                await asyncio.sleep(0.05)
+        await until(lambda: device.warm)
         client = AsyncObcClient(
             SerialHostLink(emulation.icd, emulation.ready_fields["serial"]),
             emulation.icd,

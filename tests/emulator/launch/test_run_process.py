@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import tty
 from pathlib import Path
 
@@ -21,8 +20,8 @@ from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
 from tests.emulator.workers import NEVER_READY
-from tests.patience import PATIENCE_S
 from tests.protocol.serial.composed_links import CUBESTAR
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
@@ -275,10 +274,7 @@ def test_the_worker_ends_with_a_killed_emulator_and_the_next_one_takes_its_place
     (worker,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     code, _ = emulator.end(signal.SIGKILL)
     assert code == -signal.SIGKILL
-    until = time.monotonic() + PATIENCE_S
-    while is_running(worker):
-        assert time.monotonic() < until, "the worker goes on without its parent"
-        time.sleep(0.02)
+    wait_until(lambda: not is_running(worker))
     assert link.is_symlink()
     emulator = Emulator(*arguments)
     assert emulator.read("boot_status")["boot_count"] == 2

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 AHEAD = """
 import sys

@@ -10,7 +10,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starid.attitude import Attitude
 from tests.emulator.runs import Control, FakeImager
-from tests.protocol.transports.pairs import turns
+from tests.waiting import turns
 
 SLOW_START_S = 100.0
 CLOCKS = ("real", "scaled:5", "stepped")

@@ -25,9 +25,9 @@ from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Re
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.transports.serial import open_serial
 from tests.emulator.wire import Wire
-from tests.patience import PATIENCE_S
 from tests.process.reference import bodies_in
 from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
+from tests.waiting import PATIENCE_S, until
 
 SEED = 20260101
 JUNK = 10_000
@@ -260,8 +260,7 @@ def test_a_gap_between_frames_is_kept(bench):
         for frame in encode_request_frames(Request.of(211), 1, 4):
             bus.arrive(frame)
         assert len(bus.sent) == 1
-        while len(bus.sent) < 8:
-            await asyncio.sleep(0.001)
+        await until(lambda: len(bus.sent) >= 8)
         await link.close()
 
     in_loop(scenario())
@@ -279,9 +278,7 @@ def test_the_acknowledge_of_a_reset_is_sent_in_its_turn(bench):
         boots = bench.device.boot_count
         bench.step(0.1)
         assert bench.device.boot_count == boots + 1
-        async with asyncio.timeout(PATIENCE_S):
-            while len(bus.sent) < 9:  # eight of the telemetry, one of the acknowledge
-                await asyncio.sleep(0.001)
+        await until(lambda: len(bus.sent) >= 9)  # eight of the telemetry, one of the acknowledge
         assert CanId.unpack(bus.sent[-1].id).type == MessageType.TELECOMMAND_ACK
         await link.close()
 

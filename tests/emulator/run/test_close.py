@@ -9,8 +9,7 @@ from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.errors import EmulatorError
 from tests.emulator.runs import command
-from tests.patience import PATIENCE_S
-from tests.protocol.transports.pairs import turns, until
+from tests.waiting import PATIENCE_S, turns, until
 
 LONG_STEP_S = 86_400.0
 REQUEST = bytes.fromhex("1F7FE61FFF")

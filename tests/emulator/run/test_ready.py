@@ -8,7 +8,7 @@ import pytest
 
 from starhil.emulator.launch import RunOptions
 from tests.emulator.runs import Control, FakeImager
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 MOON = {"moon": {"ra_deg": 80.0, "dec_deg": 0.0}}
 SCENARIO = """

@@ -8,8 +8,7 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
 from tests.emulator.runs import CAMERA, FirstHead, command, read
 from tests.emulator.workers import ANSWERING, WORKER
-from tests.patience import PATIENCE_S
-from tests.protocol.transports.pairs import turns
+from tests.waiting import PATIENCE_S, turns, until
 
 ENDS_AT_ONCE = ""
 ENDS_WHEN_READY = WORKER + f"send(PipelineReady({CAMERA}, 5, 0.0))\n"
@@ -50,11 +49,6 @@ def run(worker):
         asyncio.run(whole())
 
     return run
-
-
-async def until(condition):
-    while not condition():
-        await asyncio.sleep(0.01)
 
 
 def set_mode(emulation, mode):

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from starhil.emulator.simulation.threads import in_thread
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 ENDLESS = """
 import asyncio, time

@@ -25,7 +25,7 @@ from tests.emulator.truth.simulators import (
     block_of_42,
     blocks_of_42,
 )
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S, until
 
 MILLIARCSECOND = 1e-3
 START_UNIX_S = datetime(2024, 12, 31, 23, tzinfo=UTC).timestamp()
@@ -229,8 +229,7 @@ def test_a_42_that_comes_later_is_connected_to(run, caplog, monkeypatch):
         port = gone.sockets[0].getsockname()[1]
         gone.close()
         await emulation.truth.set(type(emulation.profile).model_validate(truth_of(port)).truth)
-        while "no connection" not in caplog.text:
-            await asyncio.sleep(0.01)
+        await until(lambda: "no connection" in caplog.text)
         stub = Stub42(blocks_of_42(11))
         await asyncio.start_server(stub.send, "127.0.0.1", port)
         async with asyncio.timeout(PATIENCE_S):

@@ -23,7 +23,7 @@ from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
 from starid.catalog.earth import unix_time
 from tests.emulator.cli.command_line import run_command_line
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 SLEW = SlewTruth(
     Attitude.from_radec_roll(83.8, -1.2, 30.0),

@@ -14,8 +14,8 @@ from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.files.bundled import UNITS_FOLDER
 from starhil.protocol.unit import load_unit
 from tests.emulator.units.clients import Emulated, arcseconds_between, true_matrix, with_unit
-from tests.patience import PATIENCE_S
 from tests.protocol.canopen.conftest import import_eds
+from tests.waiting import PATIENCE_S
 
 NODE = 0x2C
 STANDBY, STAR_TRACK = 2, 4

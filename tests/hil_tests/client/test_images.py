@@ -17,7 +17,7 @@ from starhil.hil_tests.errors import BenchError, NackError
 from starhil.protocol.can.cubespace import CanHostReceiver, encode_reply_frames
 from starhil.protocol.image_transfer import burst_packet, file_checksum, frame_checksum, packet_count
 from starhil.protocol.messages import BURST_ID, ErrorCode, Reply, ReplyKind
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 PIXELS = np.arange(64 * 64, dtype=np.uint8).reshape(64, 64)
 FILE = cv2.imencode(".bmp", PIXELS)[1].tobytes()

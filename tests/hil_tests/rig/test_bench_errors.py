@@ -22,7 +22,7 @@ from starhil.hil_tests.timing.realtime import set_realtime_priority
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import ReplyKind, Request, RequestKind
 from starhil.protocol.unit import load_unit
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 ICD = load_unit()
 READY = "print('Hello', flush=True); print('ready unit=sagitta serial=/dev/x', flush=True)"

@@ -15,7 +15,7 @@ from starhil.hil_tests.reports import prepare_report, write_junit, write_report
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess
 from starhil.hil_tests.rig.rig import LinkOptions, Rig
 from starhil.protocol.unit import load_unit
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 READY = "import sys, time; print('ready serial=none', flush=True); "
 DIES = READY + "print('Segmentation of the sky', file=sys.stderr); sys.exit(7)"

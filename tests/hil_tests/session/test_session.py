@@ -30,7 +30,7 @@ from starhil.protocol.unit import load_unit
 from starid.errors import StaridError
 from tests.candump import read_candump
 from tests.hil_tests.fake_device import FakeDevice
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 ICD = load_unit()
 

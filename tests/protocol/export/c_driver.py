@@ -20,7 +20,7 @@ from starhil.protocol.icd.codec import Field, Row
 from starhil.protocol.icd.quoting import c_member
 from starhil.protocol.icd.values import Value
 from starhil.protocol.serial.stack import SerialStack
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 FLAGS = [
     "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 FIELDS = ("can.id", "can.flags.xtd", "frame.protocols", "_ws.malformed", "_ws.col.Info")
 

@@ -17,8 +17,8 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import TURN_S, TransportError
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.python_can import QUEUE_LIMIT, PythonCanTransport
-from tests.patience import PATIENCE_S
-from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, CanPair, can_pair, until
+from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, CanPair, can_pair
+from tests.waiting import PATIENCE_S, until
 
 MARK = CanFrame(0x7A5, b"end", extended=False)
 

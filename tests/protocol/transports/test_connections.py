@@ -13,8 +13,7 @@ from starhil.protocol.can.socketcand import format_send
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.connections import WINDOW
 from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub, FairQueue
-from tests.patience import PATIENCE_S
-from tests.protocol.transports.pairs import turns, until
+from tests.waiting import PATIENCE_S, turns, until
 
 FLOOD = CanFrame(0x123, bytes(8), extended=False)
 REQUEST = CanFrame(0x200, b"\x01", extended=False)

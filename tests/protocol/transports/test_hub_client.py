@@ -18,8 +18,8 @@ from starhil.protocol.transports.can import new_hub, open_can
 from starhil.protocol.transports.hub import DEFAULT_HOST, CanHub
 from starhil.protocol.transports.hub_client import BACKLOG_LIMIT as HUB_BACKLOG
 from starhil.protocol.transports.hub_client import AutoHubTransport
-from tests.patience import PATIENCE_S
-from tests.protocol.transports.pairs import FRAMES, CanPair, until
+from tests.protocol.transports.pairs import FRAMES, CanPair
+from tests.waiting import PATIENCE_S, until
 
 
 def test_a_restarted_hub_is_found_again() -> None:

@@ -18,8 +18,8 @@ from starhil.protocol.transports.base import TransportError
 from starhil.protocol.transports.paced import BACKLOG_LIMIT, PacedTransport
 from starhil.protocol.transports.serial import open_serial
 from tests.conformance.simulated import SimulatedLoop
-from tests.patience import PATIENCE_S
-from tests.protocol.transports.pairs import SERIAL_KINDS, serial_pair, until
+from tests.protocol.transports.pairs import SERIAL_KINDS, serial_pair
+from tests.waiting import PATIENCE_S, until
 
 
 @pytest.mark.parametrize("kind", SERIAL_KINDS)

@@ -19,7 +19,7 @@ from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.cli import app, identify
 from tests.emulator.cli.command_line import run_command_line
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

@@ -19,7 +19,7 @@ from starid.arrays import Array
 from starid.kernels import kernel_cache
 from starid.kernels.jit import compiled, compiled_ieee, inner, inner_checked
 from starid.storage.cache import cached_files, remove
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 CALLER = """
 from other_kernels.inner import FACTOR, scaled

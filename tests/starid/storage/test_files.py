@@ -21,7 +21,7 @@ from starid.identification.thesis.database import DatabaseError
 from starid.identification.thesis.database_file import load_database
 from starid.imaging.image_io import read_image, write_image
 from starid.storage.files import read_bytes, read_number, read_text, write_atomically
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 READERS = [
     (read_image, StaridError),

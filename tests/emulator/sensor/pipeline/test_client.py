@@ -20,8 +20,7 @@ from starhil.emulator.sensor.pipeline.messages import (
 from starhil.emulator.sensor.pipeline.worker_process import WorkerThread
 from tests.emulator.runs import CAMERA
 from tests.emulator.workers import ANSWERING, WORKER
-from tests.patience import PATIENCE_S
-from tests.protocol.transports.pairs import turns
+from tests.waiting import PATIENCE_S, turns, until
 
 SETUP = pipeline_setup(Profile())
 REQUEST = ImageRequest(64)
@@ -98,8 +97,7 @@ def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_p
         imager.kill()
         imager.submit(REQUEST, answers.append)
         await imager.settle()
-        while not losses:
-            await asyncio.sleep(0.01)
+        await until(lambda: losses)
         imager.submit(REQUEST, answers.append)
         assert [type(answer) for answer in answers] == [PipelineEnded, PipelineEnded]
         await imager.restart()
@@ -133,8 +131,7 @@ def test_a_failure_handler_that_fails_keeps_no_request_pending(make_pipeline, ca
         imager.kill()
         imager.submit(REQUEST, lambda _answer: None)
         await imager.settle()
-        while "ZeroDivisionError" not in caplog.text:
-            await asyncio.sleep(0.01)
+        await until(lambda: "ZeroDivisionError" in caplog.text)
 
     run(make_pipeline, scenario)
 
@@ -151,8 +148,7 @@ def test_an_answer_that_cannot_be_read_loses_the_worker_and_is_logged(worker, ca
     async def scenario(imager):
         imager.ended.connect(losses.append)
         imager.submit(REQUEST, answers.append)
-        while not losses:
-            await asyncio.sleep(0.01)
+        await until(lambda: losses)
         await imager.settle()
         imager.submit(REQUEST, answers.append)
         assert isinstance(answers[-1], Failure)

@@ -18,7 +18,7 @@ from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.errors import StaridError
-from tests.patience import PATIENCE_S
+from tests.waiting import PATIENCE_S
 
 DEEP = StarIdentifierSetup("geometric", DEFAULT_CAMERA, 1.0, (("limiting_magnitude", 6.0),))
 SHALLOW = replace(DEEP, options=(("limiting_magnitude", 5.0),))
