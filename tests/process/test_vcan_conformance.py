@@ -10,7 +10,7 @@ from tests.process.test_conformance import conform
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
 
 CAN = ("frames", "segments", "bursts", "errors", "recovery", "timing", "unsolicited")
-CANOPEN = ("nmt", "error", "sdo", "sync", "tpdo", "rpdo")
+CANOPEN = ("nmt", "error-control", "sdo", "sdo-block", "sync", "tpdo", "rpdo")
 """Areas about IDs, kinds, order, loss and times of frames; what rows and objects hold is the same on every bus."""
 
 SPEED = 0.5
