@@ -84,11 +84,21 @@ check: $(VENV)/.developer
 
 # what only tests need is of today; oem and others of the extra `test` need more than the lowest versions
 LOWEST_TOOLS := 'pytest>=8' 'hypothesis>=6.100' msgpack cantools canmatrix space_packet_parser dcf-tools durand spiceypy
-# the tests of what calls dependencies, one line for each group of them: pydantic and xxhash, pyserial and python-can, canopen and
-# construct, jinja2; typer and rich, aiohttp, SciPy, OpenCV, pyerfa and sgp4; numpy, numba and the catalogue
-LOWEST := $(addprefix tests/protocol/,unit/test_reader.py unit/test_units.py unit/test_unit_check.py serial transports canopen export) \
-	$(addprefix tests/emulator/,cli/test_app.py console/test_server.py profile device/test_extreme_values.py sensor truth) \
-	$(addprefix tests/starid/,imaging identification/geometric camera catalog kernels)
+# of each dependency the tests of the modules that call it: another version can change only what these do
+LOWEST := $(addprefix tests/, \
+	protocol/unit/test_reader.py emulator/profile/test_profile.py \
+	protocol/serial/test_checks.py \
+	$(addprefix protocol/canopen/,test_pdo.py test_emergency.py test_eds.py test_device_dictionary.py test_library_master.py) \
+	protocol/transports/test_serial.py protocol/transports/test_can_buses.py \
+	protocol/export/test_export.py \
+	emulator/cli/test_app.py emulator/cli/test_option_groups.py emulator/cli/test_completion.py emulator/console/test_server.py \
+	emulator/benchmarks/test_ecss_errors.py starid/identification/thesis/test_rsi.py starid/identification/thesis/test_reference.py \
+	starid/imaging/test_image_io.py starid/imaging/test_dark_frame.py emulator/sensor/pipeline/test_preview.py emulator/sensor/sky \
+	emulator/truth/test_orbit.py emulator/benchmarks/test_campaign.py starid/lab/leaderboard/test_report.py \
+	starid/catalog/test_catalog.py starid/camera/test_camera.py starid/imaging/test_detection.py emulator/sensor/test_renderer.py \
+	starid/identification/geometric/test_identifier.py starid/kernels)
+# in this order: pydantic; xxhash; construct and canopen; pyserial and python-can; jinja2; typer, rich and aiohttp; SciPy and scikit-learn;
+# OpenCV and pyerfa; sgp4, joblib and matplotlib; the catalogue, numpy and numba, with kernels of each package
 out/lowest/.installed: pyproject.toml tools/lowest_versions.py
 	$(PYTHON) -m venv out/lowest
 	$(PYTHON) tools/lowest_versions.py >out/lowest/constraints.txt

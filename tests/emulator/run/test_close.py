@@ -2,6 +2,7 @@
 
 import asyncio
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -84,7 +85,11 @@ def test_a_last_write_that_fails_is_reported(run, tmp_path, monkeypatch, caplog)
     """The failure arrives in the event loop after the thread that writes has ended."""
 
     async def scenario(emulation, _line):
-        closing = threading.Event()
+        closing, shutdown = threading.Event(), ThreadPoolExecutor.shutdown
+
+        def wait_for_the_thread(executor, **options):
+            closing.set()
+            shutdown(executor, **options)
 
         def fail_slowly(_store, _content):
             closing.wait()
@@ -92,10 +97,8 @@ def test_a_last_write_that_fails_is_reported(run, tmp_path, monkeypatch, caplog)
 
         monkeypatch.setattr(FileStore, "save", fail_slowly)
         command(emulation, "save_parameters")
-        close = asyncio.create_task(run.launched.close())
-        await turns()
-        closing.set()
-        await close
+        monkeypatch.setattr(ThreadPoolExecutor, "shutdown", wait_for_the_thread)
+        await run.launched.close()
         return run.launched.failed
 
     state = {"clock": "real", "state_dir": str(tmp_path)}
