@@ -49,7 +49,7 @@ def reference() -> ModuleType:
 
 def test_the_tables_of_the_reference_pages_match_the_code(reference):
     pages = reference.pages()
-    assert {"cli.md", "control.md", "profile.md"} <= {page.name for page in pages}
+    assert {"cli.md", "control.md", "profile.md", "units.md"} <= {page.name for page in pages}
     for page in pages:
         text = page.read_text(encoding="utf-8")
         assert text == reference.with_tables(text), (
@@ -58,8 +58,23 @@ def test_the_tables_of_the_reference_pages_match_the_code(reference):
 
 
 def test_every_table_that_can_be_written_stands_on_a_page(reference):
-    text = "".join(page.read_text(encoding="utf-8") for page in reference.pages())
-    assert set(re.findall(r"^(?:<!--|#) begin: (\w+)", text, re.MULTILINE)) == set(reference.TABLES)
+    text = "".join(page.read_text(encoding="utf-8") for page in DOCS.glob("*.md"))
+    assert set(re.findall(r"^<!-- (?:begin|built): (\w+)", text, re.MULTILINE)) == set(reference.TABLES)
+
+
+def test_a_table_of_the_built_pages_has_the_options_of_a_command_and_the_quantities(reference):
+    built = "".join(
+        reference.with_built_tables((DOCS / page).read_text()) for page in ("cli.md", "quantities.md")
+    )
+    for entry in (
+        "| `--truth-log` |",
+        "| `attitude.sigma_cross` |",
+        "| `set_clock` |",
+        "| `exposure` |",
+        "### `Snapshot`",
+    ):
+        assert entry in built
+    assert "<!-- built" not in built
 
 
 @pytest.mark.parametrize(

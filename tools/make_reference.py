@@ -8,6 +8,9 @@ A page contains its own text and, between two comments with the name of a table,
     …
     <!-- end: profile -->
 
+A table too long to be read as text is only a mark, `<!-- built: commands -->`, which `make docs` replaces. The interface definition of each
+bundled unit is written beside its files, `configs/units/NAME/icd.md`.
+
 tests/test_reference.py compares every table with the code.
 """
 
@@ -21,6 +24,7 @@ import re
 import sys
 import textwrap
 from collections.abc import Callable, Container, Iterator, Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, get_args
 
@@ -32,6 +36,7 @@ from starhil.emulator.truth.config import models_in
 
 ROOT: Final = Path(__file__).resolve().parent.parent
 DOCS: Final = ROOT / "docs"
+UNITS_FOLDER: Final = ROOT / "configs" / "units"
 
 UNITS: Final = {
     "anomaly_s": "1/s",
@@ -81,7 +86,9 @@ HEAD: Final[Row] = ("key", "unit", "range", "default", "meaning")
 
 
 def table(rows: list[Row], head: Row = HEAD) -> str:
-    """Return a Markdown table without its empty columns."""
+    """Return a Markdown table without its empty columns; rows that differ only in their key are one."""
+    alike = [(key, list(group)) for key, group in groupby(rows, key=lambda row: row[1:])]
+    rows = [(", ".join(row[0] for row in group), *key) for key, group in alike]
     shown = [column for column in range(len(head)) if any(row[column] for row in rows)]
     lines = [
         "| " + " | ".join(row[column].replace("|", "\\|") for column in shown) + " |" for row in (head, *rows)
@@ -176,6 +183,8 @@ def limits(schema: Mapping[str, Any]) -> str:
         items = limits(schema.get("items", {}))
         least, most = schema.get("minItems"), schema.get("maxItems")
         count = f"{least} values" if least == most and least else f"up to {most} values" if most else "list"
+        if items.startswith(count):  # a matrix
+            return items.replace(count, f"{count.removesuffix(' values')} × {count}", 1)
         return f"{count}, each {items}" if items else count
     low, high = schema.get("minimum"), schema.get("maximum")
     if "exclusiveMinimum" in schema:
@@ -264,13 +273,18 @@ def orbit() -> str:
 
 def alternatives(annotation: Any, key: str) -> Iterator[str]:
     """Yield the section of each model of a union, with its distinguishing first key in the heading."""
+    known: dict[Row, str] = {}
     for model in models_in(annotation):
-        yield described(f'{key} = "{kind_of(model)}"`', model, skipped=1)
+        title = f'{key} = "{kind_of(model)}"`'
+        own, shared = apart(model_rows(model)[1:], known)
+        known = {row: title.strip("`") for row in own} | known
+        parts = [f"### {title}", plain_text(model.__doc__ or ""), *shared]
+        yield "\n\n".join([*parts, table(own)] if own else parts)
 
 
-def described(title: str, model: type[BaseModel], skipped: int = 0) -> str:
-    """Return the section of a model, without its first keys."""
-    return f"### {title}\n\n{plain_text(model.__doc__ or '')}\n\n{table(model_rows(model)[skipped:])}"
+def described(title: str, model: type[BaseModel]) -> str:
+    """Return the section of a model."""
+    return f"### {title}\n\n{plain_text(model.__doc__ or '')}\n\n{table(model_rows(model))}"
 
 
 def kind_of(model: type[BaseModel]) -> str:
@@ -413,7 +427,8 @@ def unit_definition() -> str:
         "members": canopen_schema.PlacedMember,
         "[[canopen.tpdo]], [[canopen.rpdo]]": canopen_schema.PdoModel,
     }
-    parts = []
+    parts: list[str] = []
+    known: dict[Row, str] = {}
     for heading, model in headings.items():
         texts = attribute_docstrings(model)
         schema = model.model_json_schema()
@@ -424,15 +439,29 @@ def unit_definition() -> str:
             for key in (field.alias or name,)
             if f'{key} = "' not in heading
         ]
-        parts.append(
-            f"### `{heading}`\n\n{plain_text(model.__doc__ or '')}" + (f"\n\n{table(rows)}" if rows else "")
-        )
+        own, shared = apart(rows, known)
+        known = dict.fromkeys(own, heading) | known
+        parts.append("\n\n".join([f"### `{heading}`", plain_text(model.__doc__ or ""), *shared]))
+        if own:
+            parts.append(table(own))
     numbers = "\n".join(f"| `{code.name.lower()}` | `{int(code)}` |" for code in ErrorCode)
     parts.append(
         "### `[errors]`\n\nThe number of each error on the wire, 0 to 0xFFFF. An error missing from an existing table is sent "
         f"as `other`, if given; `ok` keeps its default.\n\n| key | default |\n|---|---|\n{numbers}\n| `other` | |"
     )
     return "\n\n".join(parts)
+
+
+def apart(rows: list[Row], known: Mapping[Row, str]) -> tuple[list[Row], list[str]]:
+    """Return rows without those that an earlier table has too, and a line for each earlier table with several of them."""
+    elsewhere: dict[str, list[Row]] = {}
+    for row in rows:
+        elsewhere.setdefault(known.get(row, ""), []).append(row)
+    shared = {heading: same for heading, same in elsewhere.items() if heading and len(same) > 1}
+    lines = [
+        f"Also, as in `{heading}`: {', '.join(row[0] for row in same)}." for heading, same in shared.items()
+    ]
+    return [row for row in rows if known.get(row) not in shared], lines
 
 
 def quantities() -> str:
@@ -524,32 +553,45 @@ def device_parameters() -> str:
 
 def commands() -> str:
     """Every command of both programs, with its arguments and options."""
+    return "\n\n".join(command_part(name, command) for name, command in each_command())
+
+
+def command_list() -> str:
+    """Every command of both programs in one line: its arguments, and what it does."""
+    rows: list[Row] = []
+    for name, command in each_command():
+        arguments = (item for item in command.params if item.param_type_name == "argument")
+        usage = " ".join([name, *(argument_usage(item) for item in arguments)])
+        rows.append((f"`{usage}`", plain_text(inspect.cleandoc(command.help or "").split("\n\n")[0])))
+    return table(rows, ("command", "what it does"))
+
+
+def each_command() -> Iterator[tuple[str, Any]]:
+    """Yield name and command, those in groups included."""
     import typer.main
 
     from starhil.emulator.cli import app as starhil
     from starid.cli import app as starid
 
-    parts: list[str] = []
     for program in (starhil, starid):
         app: Any = typer.main.get_command(program.build_app())
         for name in program.COMMANDS:
-            parts += command_parts(f"{app.name} {name}", app.commands[name])
-    return "\n\n".join(parts)
+            group = getattr(app.commands[name], "commands", None)
+            if group is None:
+                yield f"{app.name} {name}", app.commands[name]
+            else:
+                inner = ((key, item) for key, item in group.items() if not item.hidden)
+                yield from ((f"{app.name} {name} {key}", item) for key, item in inner)
 
 
-def command_parts(name: str, command: Any) -> Iterator[str]:
-    """Yield the section of a command, or of each command in a group."""
-    if hasattr(command, "commands"):
-        for inner, item in command.commands.items():
-            if not item.hidden:
-                yield from command_parts(f"{name} {inner}", item)
-        return
+def command_part(name: str, command: Any) -> str:
+    """Return the section of a command."""
     shown = [parameter for parameter in command.params if not getattr(parameter, "hidden", False)]
     arguments = [parameter for parameter in shown if parameter.param_type_name == "argument"]
     usage = " ".join([name, *("[options]",), *(argument_usage(item) for item in arguments)])
     rows = ["| option | default | meaning |\n|---|---|---|", *(option_row(item) for item in shown)]
     text = "\n\n".join(plain_text(part) for part in inspect.cleandoc(command.help or "").split("\n\n"))
-    yield f"## {name}\n\n{text}\n\n    {usage}\n\n" + "\n".join(rows)
+    return f"## {name}\n\n{text}\n\n    {usage}\n\n" + "\n".join(rows)
 
 
 def argument_usage(parameter: Any) -> str:
@@ -584,13 +626,14 @@ def shown_default(value: Any) -> str:
 TABLES: Final[dict[str, Callable[[], str]]] = {
     function.__name__: function
     for function in (
-        *(actions, commands, device_parameters, faults, identifier, orbit, profile),
+        *(actions, command_list, commands, device_parameters, faults, identifier, orbit, profile),
         *(quantities, scenario, sensor, sky, snapshot, truth, unit_definition),
     )
 }
 """Name of a table in a page → function that writes it."""
 
 _BLOCK: Final = re.compile(r"(<!-- begin: (\w+).*?\n).*?(<!-- end: \2)", re.DOTALL)
+_BUILT: Final = re.compile(r"<!-- built: (\w+) -->")
 
 
 def with_tables(page: str) -> str:
@@ -598,19 +641,32 @@ def with_tables(page: str) -> str:
     return _BLOCK.sub(lambda found: f"{found[1]}\n{TABLES[found[2]]()}\n\n{found[3]}", page)
 
 
+def with_built_tables(page: str) -> str:
+    """Return a page with the tables that only a build has."""
+    return _BUILT.sub(lambda found: TABLES[found[1]](), page)
+
+
 def pages() -> list[Path]:
     """Return the files that contain generated tables."""
     return [path for path in sorted(DOCS.glob("*.md")) if _BLOCK.search(path.read_text(encoding="utf-8"))]
 
 
+def interfaces() -> dict[Path, str]:
+    """Return the file of each bundled unit's interface definition, and its text."""
+    from starhil.protocol.export import export
+    from starhil.protocol.files.bundled import bundled_units
+    from starhil.protocol.unit import load_unit
+
+    return {UNITS_FOLDER / name / "icd.md": export(load_unit(name), "markdown") for name in bundled_units()}
+
+
 def main() -> None:
-    """Write the tables of all files."""
-    for path in pages():
-        text = path.read_text(encoding="utf-8")
-        new = with_tables(text)
-        if new != text:
-            path.write_text(new, encoding="utf-8")
-            print(f"{path.name}: written", file=sys.stderr)
+    """Write the tables of all files, and the interface definitions."""
+    texts = {path: with_tables(path.read_text(encoding="utf-8")) for path in pages()}
+    for path, text in (texts | interfaces()).items():
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")
+            print(f"{path.relative_to(ROOT)}: written", file=sys.stderr)
 
 
 if __name__ == "__main__":
