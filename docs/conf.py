@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,6 @@ napoleon_use_rtype = False
 napoleon_use_ivar = True
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
 
 LINKS = {
     "docs/": "",
@@ -69,7 +67,7 @@ def copy_interfaces(_app: Sphinx) -> None:
 
 def put_tables(_app: Sphinx, _page: str, source: list[str]) -> None:
     """Put the reference tables in their places, and let links to interface definitions lead to the copies."""
-    from make_reference import with_built_tables
+    from starhil.emulator.cli.reference import with_built_tables
 
     text = re.sub(r"\]\((?:\.\./)?configs/units/([\w-]+)/icd\.md", r"](icd/\1.md", source[0])
     source[0] = with_built_tables(text)

@@ -63,7 +63,7 @@ class Block:
 def blocks(name: str, language: str = "") -> list[Block]:
     text = (DOCS / name).read_text(encoding="utf-8")
     return [
-        Block(match[1], match[2], re.findall(r"^##+ (.*)$", text[: match.start()], re.MULTILINE)[-1])
+        Block(match[1], match[2], re.findall(r"^#+ (.*)$", text[: match.start()], re.MULTILINE)[-1])
         for match in _FENCE.finditer(text)
         if language in ("", match[1])
     ]
