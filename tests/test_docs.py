@@ -37,6 +37,7 @@ from starhil.protocol.can.cubespace import MessageType
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.export import export
+from starhil.protocol.files.bundled import bundled_units
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -62,7 +63,7 @@ class Block:
 def blocks(name: str, language: str = "") -> list[Block]:
     text = (DOCS / name).read_text(encoding="utf-8")
     return [
-        Block(match[1], match[2], re.findall(r"^##+ (.*)$", text[: match.start()], re.MULTILINE)[-1])
+        Block(match[1], match[2], re.findall(r"^#+ (.*)$", text[: match.start()], re.MULTILINE)[-1])
         for match in _FENCE.finditer(text)
         if language in ("", match[1])
     ]
@@ -115,9 +116,11 @@ def test_the_library_example_of_the_readme_prints_the_attitude_of_its_image(tmp_
     assert run(program, {}) == "True RA 83.80, Dec -1.20\n"
 
 
-def test_icd_is_the_present_export():
-    remedy = "docs/icd.md is out of date; run: starhil icd export markdown -o docs/icd.md"
-    assert (DOCS / "icd.md").read_text(encoding="utf-8") == export(load_unit(), "markdown"), remedy
+@pytest.mark.parametrize("name", bundled_units())
+def test_the_interface_definition_beside_a_unit_is_its_present_export(name):
+    file = DOCS.parent / "configs" / "units" / name / "icd.md"
+    remedy = f"{file} is out of date; run: python tools/make_reference.py"
+    assert file.read_text(encoding="utf-8") == export(load_unit(name), "markdown"), remedy
 
 
 def table_after(name: str, heading: str) -> list[list[str]]:
