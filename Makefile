@@ -69,18 +69,20 @@ lane-vcan0:
 lane-%:
 	@$(PRIORITY) $(BIN)/python -m pytest -m "not socketcan" --junit-xml=$(REPORTS)/$*.xml $(TESTS)
 
-# of `check`, beside the tests that start processes: what computes for long, or waits for the clock
-LONG := $(addprefix tests/,process fuzzing conformance test_docs.py hil_tests/endurance hil_tests/timing hil_tests/rig starid/kernels starid/lab) \
-	$(addprefix tests/emulator/,benchmarks console launch device/test_extreme_values.py) $(addprefix tests/starid/,cli identification/thesis) \
-	$(wildcard tests/protocol/canopen/test_conformance*.py) tests/protocol/test_fuzz.py
-QUICK = $(BIN)/python -m pytest -q -m "not process and not browser and not socketcan" $(LONG:%=--ignore=%)
+# of `check`, beside the tests that start processes: what computes for seconds, or waits for the clock or a peer
+LONG := $(addprefix tests/,process fuzzing conformance test_docs.py test_public_names.py) \
+	$(addprefix tests/hil_tests/,endurance timing rig client/test_client.py) \
+	$(addprefix tests/emulator/,benchmarks console launch test_connections.py cli/test_render.py device/test_extreme_values.py \
+		profile/test_real_lens.py sensor/pipeline/test_stated_uncertainty.py) \
+	$(addprefix tests/protocol/,transports export test_hostile_text.py test_fuzz.py unit/test_unit_fuzz.py) \
+	$(wildcard $(addprefix tests/protocol/canopen/test_,conformance*.py dissection.py durand.py library_master.py sdo_stateful.py slave_fuzz.py)) \
+	$(addprefix tests/starid/,kernels lab cli imaging photograph camera/test_calibration.py catalog/test_aberration.py) \
+	$(addprefix tests/starid/identification/,thesis geometric/test_identifier_fields.py geometric/test_index_file.py)
 check: $(VENV)/.developer
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	@$(QUICK) tests/protocol tests/starid >.venv/check.log 2>&1 & other=$$!; \
-		$(QUICK) --ignore=tests/protocol --ignore=tests/starid; status=$$?; \
-		wait $$other || status=1; cat .venv/check.log; exit $$status
+	$(BIN)/python -m pytest -q -m "not process and not browser and not socketcan" $(LONG:%=--ignore=%)
 
 # what only tests need is of today; oem and others of the extra `test` need more than the lowest versions
 LOWEST_TOOLS := 'pytest>=8' 'hypothesis>=6.100' msgpack cantools canmatrix space_packet_parser dcf-tools durand spiceypy
