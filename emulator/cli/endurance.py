@@ -88,11 +88,11 @@ def command(
     ] = Path("out/endurance"),
     as_json: AsJson = False,
 ) -> None:
-    """Let units live random lives in simulated time; an oracle that knows only the bus judges them.
+    """Run units through random operation in simulated time, and check everything on the bus against an independent model.
 
-    Requests valid and invalid on every link, faults, resets, power cycles, full disks, tumbles. A life that ends in
-    a violation is shortened and written to -o as a life, a session and a recording. The exit status is 1 if
-    there is one.
+    Each run of a unit, a *life*, has valid and invalid requests on every link, faults, resets, power cycles, full disks and
+    tumbles. One that violates the interface definition is shortened and written to -o, with a session and a recording that
+    repeat it; the exit status is then 1.
     """
     if life is not None:
         from starhil.protocol.unit import check_runs_no_code
