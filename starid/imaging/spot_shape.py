@@ -242,13 +242,13 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
     longest = table[long_trails(table, shape.sigma_px)]
     if len(longest) < _MIN_LONG:
         return shape
-    found = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
+    trail = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
     positions, trails, length = _trails(longest, width, height, shape.sigma_px**2 + _PIXEL_VARIANCE)
     agree = np.count_nonzero(
-        lengths_and_mismatches(found.flow, positions, trails)[1] < _AGREEMENT_SHARE * length
+        lengths_and_mismatches(trail.flow, positions, trails)[1] < _AGREEMENT_SHARE * length
     )
     return (
-        found if found.trail_px > 0.0 and agree >= max(_MIN_LONG, _AGREEING_SHARE * len(longest)) else shape
+        trail if trail.trail_px > 0.0 and agree >= max(_MIN_LONG, _AGREEING_SHARE * len(longest)) else shape
     )
 
 
