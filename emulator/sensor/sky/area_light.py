@@ -168,7 +168,7 @@ def row_blocks(top: int, bottom: int, width: int) -> Iterator[slice]:
 def scalar_products(directions: Image, vector: Array) -> Image:
     """Scalar products (h, w) of directions (3, h, w) and a vector (3,), by a sum in fixed order."""
     a, b, c = vector.tolist()
-    product = directions[0] * np.float32(a)
+    product: Image = directions[0] * np.float32(a)
     product += directions[1] * np.float32(b)
     product += directions[2] * np.float32(c)
     return product
