@@ -42,9 +42,9 @@ from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
+from tests.waiting import PATIENCE_S
 
 DOCS = Path(__file__).parents[1] / "docs"
-PATIENCE_S = 20.0
 UNASKED = {0x0CE60401, 0x185}
 """Unsolicited telemetry, and the status that a change of mode sends: they may come between any two frames."""
 _FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -374,7 +374,7 @@ def test_walkthrough_by_steps(tmp_path):
     emulator = EmulatorProcess(command).start()
     try:
         check_program("Time by steps", emulator.ready, tmp_path)
-        assert emulator.process.wait(60) == 0  # the program ends it
+        assert emulator.process.wait(PATIENCE_S) == 0  # the program ends it
     finally:
         emulator.kill()
 
@@ -391,7 +391,7 @@ def test_walkthrough_pytest(unit, tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--rootdir={tmp_path}", str(file),
          "--starhil-can", unit["can"]],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120,
+        cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
     assert f"{block.text.count('def test_')} passed" in done.stdout

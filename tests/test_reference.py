@@ -17,6 +17,7 @@ from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_com
 from starhil.hil_tests.session.script import load_script
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -203,7 +204,7 @@ def test_the_control_channel_answers_as_the_page_shows():
     assert len(pairs) == 2
     command = emulator_command(extra=["--control", "auto", "--clock", "stepped"])
     with EmulatorProcess(command) as emulator, socket.socket(socket.AF_UNIX) as channel:
-        channel.settimeout(30)
+        channel.settimeout(PATIENCE_S)
         channel.connect(emulator.ready["control"].removeprefix("unix:"))
         lines = channel.makefile("rw")
         for request, answer in pairs:

@@ -25,10 +25,10 @@ from starhil.hil_tests.errors import BenchError
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import CAMERA, Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
+from tests.waiting import PATIENCE_S, until
 
 PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 5.0}
 ROUNDS = 10
-WITHIN_S = 60.0
 
 
 @pytest.fixture
@@ -51,13 +51,13 @@ def report_of(folder):
 async def talk(emulation, frames):
     """Command and read the device over its serial line, as an OBC does, for some frames."""
     client = AsyncObcClient(
-        SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
+        SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=PATIENCE_S
     )
     await client.start()
     await client.set_parameter("exposure", 80)
     await client.command("save_parameters")
     rounds = 0
-    async with asyncio.timeout(WITHIN_S):
+    async with asyncio.timeout(PATIENCE_S):
         while emulation.device.cycle.published < frames or rounds < ROUNDS:
             if emulation.stepper is not None:
                 await emulation.stepper.step(0.05)
@@ -141,9 +141,9 @@ def test_can_frames_and_canopen_are_repeated(record):
     bus = "virtual:recorded"
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=WITHIN_S)
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=PATIENCE_S)
         await client.start()
-        async with asyncio.timeout(WITHIN_S):
+        async with asyncio.timeout(PATIENCE_S):
             while emulation.device.cycle.published < 4:
                 await client.telemetry("precise_attitude")
                 await asyncio.sleep(0.02)
@@ -160,7 +160,7 @@ def test_frames_that_are_sent_with_gaps_and_delays_are_repeated(record):
     """The gap between two frames passes after the request, while other entries arrive."""
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink("virtual:gaps"), emulation.icd, timeout_s=WITHIN_S)
+        client = AsyncObcClient(CanHostLink("virtual:gaps"), emulation.icd, timeout_s=PATIENCE_S)
         await client.start()
         async with Control(emulation) as control:
             for fault in ({"delay_s": 0.02}, {}):
@@ -176,7 +176,9 @@ def test_frames_that_are_sent_with_gaps_and_delays_are_repeated(record):
 def test_a_unit_without_dialects_is_repeated_at_its_own_bit_rate(record):
     async def scenario(emulation, _line):
         client = AsyncObcClient(
-            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]),
+            emulation.icd,
+            timeout_s=PATIENCE_S,
         )
         await client.start()
         for _ in range(5):
@@ -194,9 +196,7 @@ def test_a_unit_without_dialects_is_repeated_at_its_own_bit_rate(record):
 def test_a_simulator_is_not_needed_for_the_replay(record, clock):
     async def scenario(emulation, _line):
         await Stub42(blocks_of_42(31)).connect(int(emulation.ready_fields["truth"].rpartition(":")[2]))
-        async with asyncio.timeout(WITHIN_S):
-            while emulation.device.cycle.published < 3:
-                await asyncio.sleep(0.02)
+        await until(lambda: emulation.device.cycle.published >= 3)
 
     folder = record(scenario, clock=clock, truth={"kind": "42", "role": "server", "port": 0})
     assert report_of(folder).differences == []
@@ -218,11 +218,11 @@ def test_a_run_whose_pipeline_dies_and_is_restarted_is_repeated(record, clock):
         imager._handle = lambda _request: PipelineEnded("killed")
         imager.ended.emit("killed")
         assert device.modes.mode.value == "error"
-        async with asyncio.timeout(WITHIN_S):
-            while not device.warm:
-                await asyncio.sleep(0.05)
+        await until(lambda: device.warm)
         client = AsyncObcClient(
-            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]),
+            emulation.icd,
+            timeout_s=PATIENCE_S,
         )
         await client.start()
         await client.command("set_mode", mode="standby")
@@ -301,7 +301,9 @@ def test_a_changed_byte_of_a_message_that_no_longer_decodes_is_named(record, at,
 
     async def scenario(emulation, _line):
         client = AsyncObcClient(
-            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]),
+            emulation.icd,
+            timeout_s=PATIENCE_S,
         )
         await client.start()
         await client.command("go")
@@ -331,7 +333,7 @@ def test_a_changed_address_of_a_can_frame_is_shown_in_both_frames(record):
     bus = "virtual:id"
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=WITHIN_S)
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=PATIENCE_S)
         await client.start()
         for name in ("identification", "device_status", "identification"):
             await client.telemetry(name)
@@ -350,7 +352,7 @@ def test_a_changed_can_frame_is_named_by_its_row_or_its_meaning_in_canopen(recor
     bus = "virtual:changed"
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=WITHIN_S)
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=PATIENCE_S)
         await client.start()
         await client.telemetry("device_status")
         await client.close()

@@ -23,6 +23,7 @@ from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
 from starid.catalog.earth import unix_time
 from tests.emulator.cli.command_line import run_command_line
+from tests.waiting import PATIENCE_S
 
 SLEW = SlewTruth(
     Attitude.from_radec_roll(83.8, -1.2, 30.0),
@@ -107,7 +108,7 @@ def orekit(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_orekit(*arguments: object) -> str:
     command = [sys.executable, Path(__file__).with_name("orekit_files.py"), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -17,7 +17,8 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import TURN_S, TransportError
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.python_can import QUEUE_LIMIT, PythonCanTransport
-from tests.protocol.transports.pairs import CAN_KINDS, DEADLINE_S, FRAMES, HAS_VCAN, CanPair, can_pair, until
+from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, CanPair, can_pair
+from tests.waiting import PATIENCE_S, until
 
 MARK = CanFrame(0x7A5, b"end", extended=False)
 
@@ -80,7 +81,7 @@ def test_a_burst_leaves_the_loop_to_others_after_some_15_frames(kind: str) -> No
             counts = [0]
             for number in range(300):
                 pair.one.send(CanFrame(number, bytes(8), extended=False))
-            async with asyncio.timeout(DEADLINE_S):
+            async with asyncio.timeout(PATIENCE_S):
                 while counts[-1] < 300:
                     await asyncio.sleep(0)
                     counts.append(len(pair.got_two))
@@ -97,7 +98,7 @@ def test_frames_that_are_much_work_leave_the_loop_to_others_one_by_one(kind: str
             counts = [0]
             for number in range(60):
                 pair.one.send(CanFrame(number, bytes(8), extended=False))
-            async with asyncio.timeout(DEADLINE_S):
+            async with asyncio.timeout(PATIENCE_S):
                 while counts[-1] < 60:
                     await asyncio.sleep(0)
                     counts.append(len(pair.got_two))

@@ -24,8 +24,7 @@ from starhil.protocol.can.socketcand import (
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub
 from tests.candump import read_candump
-
-PATIENCE_S = 20.0
+from tests.waiting import PATIENCE_S
 
 
 class Peer:
