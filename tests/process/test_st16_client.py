@@ -19,6 +19,7 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from tests.process.conftest import NO_IMAGES
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
@@ -88,7 +89,7 @@ def test_a_client_by_the_text_reads_the_attitude_of_a_running_emulator(tmp_path)
         try:
             tty.setraw(port)
             assert reply(port, message(0x80))[0] == 0xA0  # PING: final, acknowledged (35910)
-            end, code = time.monotonic() + 30.0, 0
+            end, code = time.monotonic() + PATIENCE_S, 0
             while not code & VALID and time.monotonic() < end:
                 time.sleep(0.2)
                 control, data = reply(port, message(0x80 | 0x12, PROCEDURE))
