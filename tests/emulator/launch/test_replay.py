@@ -9,12 +9,13 @@ import json
 import os
 import platform
 import re
+import shutil
 
 import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions, machine
-from starhil.emulator.launch.recording import prepare_recording, read_run
+from starhil.emulator.launch.recording import copy_state, prepare_recording, read_run
 from starhil.emulator.launch.replay import replay
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.run.recorder import EVENTS_FILE, RUN_FILE, SCENARIO_FILE, TRUTH_FILE
@@ -22,6 +23,7 @@ from starhil.emulator.sensor.pipeline.messages import PipelineEnded, PipelineRea
 from starhil.hil_tests.client import AsyncObcClient
 from starhil.hil_tests.client.links import CanHostLink, SerialHostLink
 from starhil.hil_tests.errors import BenchError
+from starhil.protocol.files.bundled import UNITS_FOLDER
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import CAMERA, Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
@@ -135,6 +137,76 @@ def test_runs_with_other_state_folders_are_recorded_alike(tmp_path):
         written.append((folder / RUN_FILE).read_bytes())
     assert written[0] == written[1]
     assert read_run(folder).profile.run.state_dir == "state"
+
+
+@pytest.fixture
+def unit_of_others(tmp_path):
+    """Return the folder of a unit whose Python file leaves a mark, and the mark."""
+    mark, unit = tmp_path / "mark", tmp_path / "others" / "unit"
+    shutil.copytree(UNITS_FOLDER / "st16", unit)
+    with (unit / "unit.py").open("a") as file:
+        file.write(f"\nopen({str(mark)!r}, 'w').close()\n")
+    return unit, mark
+
+
+def test_nothing_runs_that_only_a_recording_names(tmp_path, unit_of_others, monkeypatch):
+    unit, mark = unit_of_others
+    folder = tmp_path / "recorded"
+    prepare_recording(folder, Profile(unit=str(unit)), "")
+    status, _, err = run_command_line("replay", str(folder))
+    assert (status, mark.exists()) == (2, False)
+    assert err.count("\n") == 1
+    assert (
+        f"whose Python file unit.py would run; if you trust it, name the unit yourself: --unit {unit}" in err
+    )
+    # nor a unit that is inside a recording, wherever that lies
+    content = json.loads((folder / RUN_FILE).read_text())
+    content["folder"], content["profile"]["unit"] = ".", "others/unit"
+    (folder / RUN_FILE).write_text(json.dumps(content))
+    monkeypatch.chdir(tmp_path)
+    assert run_command_line("replay", str(folder))[0] == 2
+    assert not mark.exists()
+    status, _, err = run_command_line("replay", str(folder), "--unit", "others/unit")
+    assert mark.exists()
+    assert f"{folder / EVENTS_FILE}: cannot be read" in err  # there is no tape
+
+
+def test_a_unit_of_toml_alone_is_replayed_from_where_it_was(tmp_path):
+    unit = tmp_path / "unit"
+    shutil.copytree(UNITS_FOLDER / "st200", unit)
+    folder = tmp_path / "recorded"
+    prepare_recording(folder, Profile(unit=str(unit)), "")
+    _, _, err = run_command_line("replay", str(folder))
+    assert f"{folder / EVENTS_FILE}: cannot be read" in err
+
+
+@pytest.mark.parametrize("trap", ["loop", "device", "pipe"])
+def test_of_a_state_folder_only_the_files_of_a_device_are_copied(tmp_path, trap):
+    state = tmp_path / "state"
+    state.mkdir()
+    (state / "device.json").write_text("{}")
+    match trap:
+        case "loop":
+            (state / "loop").symlink_to(".")
+        case "device":
+            (state / "zero").symlink_to("/dev/zero")
+        case _:
+            os.mkfifo(state / "pipe")
+    folder = tmp_path / "recorded"
+    prepare_recording(folder, Profile(run={"state_dir": str(state)}), "")
+    assert [path.name for path in (folder / "state").iterdir()] == ["device.json"]
+    copy_state(state, tmp_path / "copy")
+    assert [path.name for path in (tmp_path / "copy").iterdir()] == ["device.json"]
+
+
+def test_a_state_file_that_cannot_be_read_is_named(tmp_path):
+    folder = tmp_path / "recorded"
+    prepare_recording(folder, Profile(run={"state_dir": str(tmp_path / "none")}), "")
+    (folder / "state").mkdir()
+    os.mkfifo(folder / "state" / "device.json")
+    status, _, err = run_command_line("replay", str(folder))
+    assert (status, err.count("\n")) == (2, 1)
+    assert f"replay {folder / 'state'}: cannot be read (not a regular file)" in err
 
 
 def test_can_frames_and_canopen_are_repeated(record):

@@ -146,6 +146,24 @@ def test_malformed_commands_are_answered_by_an_error_and_change_nothing(text: st
     run(scenario)
 
 
+@pytest.mark.parametrize("text", [">", "<>", "<a>", "< send >", "<x", "x"])
+def test_answers_to_a_flood_of_malformed_commands_are_no_multiple_of_it(text: str) -> None:
+    async def scenario(hub: CanHub) -> None:
+        one, two = await Peer.join(hub), await Peer.join(hub)
+        flood = text * (64_000 // len(text))
+        one.write(flood)
+        one.write("> < echo >")
+        answer = ""
+        while "< echo >" not in answer:
+            answer += await one.read()
+        assert answer.startswith("< error ")
+        assert len(answer) < len(flood) / 20
+        one.write("< send 123 1 1 >")
+        assert (await two.frame()).id == 0x123
+
+    run(scenario)
+
+
 def test_nothing_can_be_sent_before_a_bus_is_open() -> None:
     async def scenario(hub: CanHub) -> None:
         peer = await Peer.join(hub, None)
