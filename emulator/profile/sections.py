@@ -101,6 +101,11 @@ class DeviceConfig(Strict):
     """Time in boot mode after a start or reset, in simulation time."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Number of valid frames from which the body rate is estimated, if the star identifier does not do so."""
+    tracking_stars: Literal[0] | Annotated[int, Field(ge=2, le=50)] = 2
+    """Least number of matched stars in tracking, where the predicted attitude verifies few stars, which may then be fainter
+    (3 sigmas). 0: `min_stars_matched`, as lost in space."""
+    tracking_windows: bool = False
+    """Whether the unit searches only windows around the predicted stars when it tracks, and the whole image only if that fails."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
     """Number of frames averaged into the dark frame that the unit subtracts from each image; 0: none."""
 
