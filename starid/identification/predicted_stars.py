@@ -5,10 +5,10 @@ pixel, and how bright. A detection near such a place, as bright as expected, is 
 out of the noise. The prediction and the stars are combined by weighted least squares, so even two close stars do not leave the
 roll open.
 
-The bound on the probability of a false answer is ``Π mᵢ pᵢ / k!``: k detections lie near places by chance. pᵢ is the mean
-number of false detections in the gate of star i that are as significant as the one found there: local maxima of noise; if the
-prediction is wrong, other stars of its brightness, as many as the catalogue has in the field; and whatever else the image shows
-around that place, such as the edge of a body, counted in the image itself. mᵢ is the number of places of stars of that brightness.
+The bound on the probability of a false answer is ``Π λᵢ / k!``: k detections lie near places by chance. λᵢ is the mean number of
+detections like the one of star i in the gates of all places of stars of its brightness: local maxima of noise; if the prediction is
+wrong, other stars, as many as the catalogue has in the field; and whatever else the image shows around the places, such as the edge of
+a body, counted in the image itself.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def solve_with_prediction(
     zero_point: float,
     max_false_probability: float,
     *,
-    crowd: Array | None = None,
+    rivals: Array | None = None,
     observer_velocity: Array | None = None,
     known: Array | None = None,
 ) -> Solution:
@@ -91,8 +91,8 @@ def solve_with_prediction(
         V of a star that yields a flux of one, for a star of solar colour.
     max_false_probability : float
         Largest bound on the probability of a false answer.
-    crowd : ndarray (n,), optional
-        Other detections around the place of each, per square pixel; see `detect_near`.
+    rivals : ndarray (n,), optional
+        Detections like each, per square pixel, around all places; see `detect_near`.
     observer_velocity : ndarray (3,), optional
         See `starid.identification.star_identifier.StarIdentifier.identify`.
     known : ndarray (9, 9), optional
@@ -143,10 +143,10 @@ def solve_with_prediction(
     alike = (
         np.abs(magnitude[place, None] - magnitude[None, :]) <= MAGNITUDE_GATE + 3.0 * blur[row, None]
     ).sum(axis=1)
-    density = noise_peaks(ratio, found.psf_sigma_px) + alike / (camera.width * camera.height)
-    if crowd is not None:
-        density = density + crowd[row]
-    log_false = float(np.log(alike * area * density).sum()) - math.lgamma(len(pairs) + 1)
+    by_chance = alike * (noise_peaks(ratio, found.psf_sigma_px) + alike / (camera.width * camera.height))
+    if rivals is not None:
+        by_chance = by_chance + rivals[row]
+    log_false = float(np.log(area * by_chance).sum()) - math.lgamma(len(pairs) + 1)
     if log_false > math.log(max_false_probability):
         return invalid
     # errors of the camera displace neighbouring stars alike, so they are not averaged

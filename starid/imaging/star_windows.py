@@ -23,6 +23,9 @@ TILE_PX: Final = 2 * BLOCK_PX
 MAX_RADIUS_PX: Final = BLOCK_PX / 2.0
 """Largest radius: the background of a tile is interpolated between the centres of its own blocks."""
 
+_RIVAL_SHARE: Final = 0.4
+"""Flux from which another detection is like a star, as a share of the star's: a magnitude."""
+
 _MIN_EDGE_PX: Final = 8
 """Places nearer to the edge of the image are left out: the windows of their stars would extend into other tiles."""
 
@@ -36,8 +39,9 @@ def detect_near(
     -------
     found : Detections
         Stars within `radius_px` of a place, each once, brightest first. Trails are not followed.
-    crowd : ndarray (n,)
-        Other detections within half a block of the place of each, per square pixel: how often one is found there by chance.
+    rivals : ndarray (n,)
+        Other detections around the places, at most a magnitude fainter, per square pixel and summed over the places: times an
+        area, the mean number of such detections that lie by chance in windows of that area.
     """
     if not 0.0 < radius_px <= MAX_RADIUS_PX:
         raise StaridError(f"radius_px: must be above 0 and at most {MAX_RADIUS_PX:g}, not {radius_px:g}")
@@ -70,13 +74,16 @@ def detect_near(
     xy = found.xy_px - TILE_PX * at + corners[tile]
     distance = np.hypot(*(xy - places[used][tile]).T)
     around = first & (distance <= MAX_RADIUS_PX)
-    crowd = (np.bincount(tile[around], minlength=used.size) - 1) / (np.pi * MAX_RADIUS_PX**2)
+    off = xy[:, None, :] - places[None, :, :]
+    elsewhere = around & ~(np.einsum("nmk,nmk->nm", off, off) <= radius_px * radius_px).any(axis=1)
+    count = np.count_nonzero(elsewhere & (found.flux >= _RIVAL_SHARE * found.flux[:, None]), axis=1)
+    rivals = count / (np.pi * (MAX_RADIUS_PX**2 - radius_px**2))
     near = np.flatnonzero(around & (distance <= radius_px))
     near = near[np.argsort(distance[near], kind="stable")]
     pixel = np.rint(xy[near]).astype(np.int64)
     _, once = np.unique(pixel[:, 1] * width + pixel[:, 0], return_index=True)
     kept = np.sort(near[once])
-    return _chosen(found, xy, kept), crowd[tile[kept]]
+    return _chosen(found, xy, kept), rivals[kept]
 
 
 def _chosen(found: Detections, xy: Array, kept: Indices) -> Detections:

@@ -52,10 +52,11 @@ from starid.camera.calibration import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
 from starid.catalog.aberration import aberrated
 from starid.errors import StaridError
-from starid.identification.geometric.identifier import BLEND_PX, Effort
+from starid.identification.geometric.identifier import Effort
 from starid.identification.geometric.index_choice import pixels_per_radian
 from starid.identification.geometric.pattern_index import resolved_stars
 from starid.identification.geometric.refinement import PRIOR_FREEDOM
+from starid.identification.options import GeometricOptions
 from starid.identification.predicted_stars import expected_places, solve_with_prediction
 from starid.identification.solution import Reason, Solution
 from starid.identification.star_identifier import StarIdentifier
@@ -75,7 +76,7 @@ _TRACKED_LIMITS: Final = 4
 """Number of lists of stars to look for that are kept, by limiting magnitude."""
 
 _LONGEST_STILL_PX: Final = 1.0
-"""Longest trail in windows: only the whole image shows how trails run."""
+"""Longest trail of a star that is taken for a spot."""
 
 _MAX_FALSE_PROBABILITY: Final = Effort().max_false_probability_tracking
 
@@ -240,7 +241,7 @@ class Pipeline:
             found = self._detect(exposure, request, sensor)
             detected = time.perf_counter()
             solution = self._solve(identifier, found, request)
-        if not solution.valid:
+        if not solution.valid or _less_certain(solution, request):
             found, solution = self._follow(exposure, request, sensor, identifier, found, solution)
         solved = time.perf_counter()
         times = (begin, rendered, detected, solved)
@@ -378,7 +379,7 @@ class Pipeline:
         """Look for few and faint stars where a prediction expects them; return detections and solution, or those given."""
         covariance, least = request.prediction_covariance, self._setup.tracking_stars
         predicted = self._window_centre(request)
-        if covariance is None or least == 0 or found.trail_px > 0.0 or predicted is None:
+        if covariance is None or least == 0 or predicted is None or self._leaves_trails(request):
             return found, failed
         settings, camera = request.settings, calibrated_camera(self.camera, request.settings)
         stars = self._tracked_stars(
@@ -392,13 +393,13 @@ class Pipeline:
             known,
             threshold_sigma=min(_TRACKED_SIGMA, known.threshold_sigma),
             min_star_pixels=0,
-            psf_sigma_px=found.psf_sigma_px or known.psf_sigma_px,
+            psf_sigma_px=sensor.mean_psf_sigma_px,
         )
-        seen, crowd = detect_near(image, places, _window_px(settings), faint)
+        seen, rivals = detect_near(image, places, _window_px(settings), faint)
         solution = solve_with_prediction(
             camera, stars, seen, predicted, covariance,
             2.5 * math.log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY,
-            crowd=crowd, observer_velocity=request.observer_velocity, known=self._calibration,
+            rivals=rivals, observer_velocity=request.observer_velocity, known=self._calibration,
         )  # fmt: skip
         if not solution.valid or solution.star_count < least:
             return found, failed
@@ -409,10 +410,8 @@ class Pipeline:
         self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel
     ) -> Detections | None:
         """Detect the brightest predicted stars in windows; None if the unit does not, or if stars leave trails."""
-        rate, predicted = request.predicted_rate_rad_s, self._window_centre(request)
-        if not self._setup.tracking_windows or rate is None or predicted is None:
-            return None
-        if np.linalg.norm(rate) * request.exposure_s * max(self.camera.focal_px) > _LONGEST_STILL_PX:
+        predicted = self._window_centre(request)
+        if not self._setup.tracking_windows or predicted is None or self._leaves_trails(request):
             return None
         settings = request.settings
         stars = self._tracked_stars(settings.limiting_magnitude)
@@ -420,6 +419,12 @@ class Pipeline:
         image, known = self._detection(exposure, request, sensor)
         found, _ = detect_near(image, places[: settings.max_stars_matched], _window_px(settings), known)
         return found
+
+    def _leaves_trails(self, request: FrameRequest) -> bool:
+        """Whether stars leave trails at the predicted rate: only the whole image shows how they run."""
+        rate = request.predicted_rate_rad_s or (0.0, 0.0, 0.0)
+        trail_px = float(np.linalg.norm(rate)) * request.exposure_s * max(self.camera.focal_px)
+        return trail_px > _LONGEST_STILL_PX
 
     def _window_centre(self, request: FrameRequest) -> Attitude | None:
         """Return the prediction if windows can be laid: not with a damaged catalogue, whose list of stars is another one."""
@@ -436,7 +441,7 @@ class Pipeline:
     def _tracked_stars(self, limiting_magnitude: float) -> StarCatalog:
         """Return the stars to a limit, as the camera resolves them."""
         if limiting_magnitude not in self._tracked:
-            blend_rad = BLEND_PX / pixels_per_radian(self.camera)
+            blend_rad = GeometricOptions().blend_px / pixels_per_radian(self.camera)
             if len(self._tracked) >= _TRACKED_LIMITS:
                 self._tracked.clear()
             self._tracked[limiting_magnitude] = resolved_stars(self.catalog, limiting_magnitude, blend_rad)
@@ -553,6 +558,12 @@ def _offsets(identifier: StarIdentifier, solution: Solution, xy: Array, request:
 def _camera_of(solution: Solution, identifier: StarIdentifier) -> Camera:
     """Return the camera with which an attitude was found: the calibrated one, or that one refined by the solution."""
     return identifier.camera if solution.camera is None else solution.camera
+
+
+def _less_certain(solution: Solution, request: FrameRequest) -> bool:
+    """Whether a valid solution is less certain than the prediction, about some axis."""
+    expected = request.prediction_covariance
+    return expected is not None and bool(np.any(np.diag(solution.covariance) > np.diag(expected)))
 
 
 def _window_px(settings: SolverSettings) -> float:
