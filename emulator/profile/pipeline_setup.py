@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TypeAlias
 
 from starhil.emulator.profile.profile import Profile
@@ -46,6 +47,7 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
         previews=previews,
         dark_frames=profile.device.dark_frames,
         tracking_stars=profile.device.tracking_stars,
+        tracking_error_rad=math.radians(profile.device.tracking_error_deg),
         tracking_windows=profile.device.tracking_windows,
         calibration=profile.calibration.matrix(),
         exposure_s=float(profile.parameters.get("exposure", 200)) / 1000.0,

@@ -9,6 +9,11 @@ The bound on the probability of a false answer is ``Π λᵢ / k!``: k detection
 detections like the one of star i in the gates of all places of stars of its brightness: local maxima of noise; if the prediction is
 wrong, other stars, as many as the catalogue has in the field; and whatever else the image shows around the places, such as the edge of
 a body, counted in the image itself.
+
+The stars must also be able to contradict the prediction. An error e of the prediction passes the test of its difference d from the
+attitude of the stars alone, ``dᵀ (C + S)⁻¹ d ≤ g`` with the covariances C and S of both, and leaves an error ``S (C + S)⁻¹ e`` in the
+answer: about axis i at most ``√(g (S − P)ᵢᵢ)``, where P is the covariance of the answer. This is the protection level of integrity
+monitoring.
 """
 
 from __future__ import annotations
@@ -35,6 +40,12 @@ GATE: Final = 13.8
 
 MAGNITUDE_GATE: Final = 1.0
 """Largest difference from the expected magnitude, besides three sigmas of the flux: colours of stars, and their variability."""
+
+_SINGULAR: Final = 1e12
+"""Condition from which stars do not determine all three axes."""
+
+_MAX_CONTRADICTION: Final = 11.34
+"""Largest squared difference of prediction and stars over its variance (χ², 3 degrees of freedom): 1 % of good predictions have more."""
 
 _MAX_CHI2: Final = (13.8, 18.5, 22.5, 26.1, 29.6, 32.9, 36.1, 39.3, 42.3, 45.3)
 """Quantiles of χ² with 2, 4, 6 … degrees of freedom that 0.1 % exceed."""
@@ -68,6 +79,7 @@ def solve_with_prediction(
     covariance: Array,
     zero_point: float,
     max_false_probability: float,
+    max_error_rad: float,
     *,
     rivals: Array | None = None,
     observer_velocity: Array | None = None,
@@ -91,6 +103,8 @@ def solve_with_prediction(
         V of a star that yields a flux of one, for a star of solar colour.
     max_false_probability : float
         Largest bound on the probability of a false answer.
+    max_error_rad : float
+        Largest error about any axis that a wrong prediction may leave unnoticed.
     rivals : ndarray (n,), optional
         Detections like each, per square pixel, around all places; see `detect_near`.
     observer_velocity : ndarray (3,), optional
@@ -128,7 +142,7 @@ def solve_with_prediction(
         weights = np.linalg.inv(
             gates[place, row] - slopes[place] @ covariance @ slopes[place].transpose(0, 2, 1)
         )
-        turn, gain = _combined(slopes[place], off[place, row], weights, covariance)
+        turn, gain, information = _combined(slopes[place], off[place, row], weights, covariance)
         residual = off[place, row] - slopes[place] @ turn
         each = np.einsum("ni,nij,nj->n", residual, weights, residual)
         chi2 = float(each.sum() + turn @ np.linalg.solve(covariance, turn))
@@ -136,6 +150,8 @@ def solve_with_prediction(
             break
         pairs = np.delete(pairs, int(np.argmax(each)), axis=0)
     else:
+        return invalid
+    if _unnoticed_rad(turn, information, covariance) > max_error_rad:
         return invalid
     area = math.pi * GATE * np.sqrt(np.linalg.det(gates[place, row]))
     ratio = np.maximum(found.flux[row] / found.flux_sigma[row], 1.0)
@@ -181,8 +197,23 @@ def _assigned(cost: Array) -> Indices:
     return np.array(chosen, dtype=np.int64).reshape(-1, 2)
 
 
-def _combined(slopes: Array, off: Array, weights: Array, covariance: Array) -> tuple[Array, Array]:
-    """Rotation (3,) from the prediction to the weighted mean of prediction and stars, and the gains (n, 3, 2) of the stars."""
-    information = np.linalg.inv(covariance) + np.einsum("nij,nik,nkl->jl", slopes, weights, slopes)
-    gain = np.linalg.inv(information) @ slopes.transpose(0, 2, 1) @ weights
-    return np.asarray(np.einsum("nij,nj->i", gain, off)), np.asarray(gain)
+def _combined(slopes: Array, off: Array, weights: Array, covariance: Array) -> tuple[Array, Array, Array]:
+    """Return the rotation (3,) from the prediction to its weighted mean with the stars, the gains (n, 3, 2) of the stars, and the
+    information (3, 3) of the stars alone.
+    """
+    information = np.einsum("nij,nik,nkl->jl", slopes, weights, slopes)
+    gain = np.linalg.inv(np.linalg.inv(covariance) + information) @ slopes.transpose(0, 2, 1) @ weights
+    return np.asarray(np.einsum("nij,nj->i", gain, off)), np.asarray(gain), np.asarray(information)
+
+
+def _unnoticed_rad(turn: Array, information: Array, covariance: Array) -> float:
+    """Largest error about any axis that a wrong prediction may leave; infinite if stars and prediction contradict each other."""
+    prior = np.linalg.inv(covariance)
+    if np.linalg.cond(information) > _SINGULAR:
+        return math.inf
+    stars = np.linalg.inv(information)
+    alone = stars @ (prior + information) @ turn
+    if alone @ np.linalg.solve(covariance + stars, alone) > _MAX_CONTRADICTION:
+        return math.inf
+    left = np.diag(stars - np.linalg.inv(prior + information))
+    return math.sqrt(_MAX_CONTRADICTION * max(float(left.max()), 0.0))

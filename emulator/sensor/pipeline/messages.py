@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 import struct
 from collections.abc import Mapping
@@ -104,6 +105,8 @@ class PipelineSetup:
     exact."""
     tracking_stars: int = 2
     """Least number of stars in tracking if the error of the prediction is known; 0: as lost in space."""
+    tracking_error_rad: float = math.radians(0.3)
+    """Largest error that few stars may leave unnoticed if the prediction is wrong, radians."""
     tracking_windows: bool = False
     """Whether to search only windows around predicted stars first, when tracking."""
     exposure_s: float = 0.2

@@ -399,7 +399,7 @@ class Pipeline:
         solution = solve_with_prediction(
             camera, stars, seen, predicted, covariance,
             2.5 * math.log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY,
-            rivals=rivals, observer_velocity=request.observer_velocity, known=self._calibration,
+            self._setup.tracking_error_rad, rivals=rivals, observer_velocity=request.observer_velocity, known=self._calibration,
         )  # fmt: skip
         if not solution.valid or solution.star_count < least:
             return found, failed

@@ -18,6 +18,7 @@ from starid.imaging.detection import Detections
 SIGMA_RAD = 60.0 / 206265.0
 PRIOR = np.diag([SIGMA_RAD**2, SIGMA_RAD**2, 4.0 * SIGMA_RAD**2])
 ZERO_POINT, SNR, POSITION_PX = 14.0, 8.0, 0.15
+MAX_ERROR_RAD = math.radians(0.3)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,9 @@ def image(truth: Attitude, stars: StarCatalog, count: int | None, rng: np.random
 
 
 def solve(found: Detections, predicted: Attitude, stars: StarCatalog) -> Solution:
-    return solve_with_prediction(DEFAULT_CAMERA, stars, found, predicted, PRIOR, ZERO_POINT, 1e-5)
+    return solve_with_prediction(
+        DEFAULT_CAMERA, stars, found, predicted, PRIOR, ZERO_POINT, 1e-5, MAX_ERROR_RAD
+    )
 
 
 @pytest.mark.parametrize("ratio", [3.0, 3.5, 4.0])
