@@ -198,9 +198,7 @@ def _assigned(cost: Array) -> Indices:
 
 
 def _combined(slopes: Array, off: Array, weights: Array, covariance: Array) -> tuple[Array, Array, Array]:
-    """Return the rotation (3,) from the prediction to its weighted mean with the stars, the gains (n, 3, 2) of the stars, and the
-    information (3, 3) of the stars alone.
-    """
+    """Return the weighted mean of prediction and stars, a rotation (3,), the gains (n, 3, 2), and the stars' information (3, 3)."""
     information = np.einsum("nij,nik,nkl->jl", slopes, weights, slopes)
     gain = np.linalg.inv(np.linalg.inv(covariance) + information) @ slopes.transpose(0, 2, 1) @ weights
     return np.asarray(np.einsum("nij,nj->i", gain, off)), np.asarray(gain), np.asarray(information)

@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, Indices
+from starid.arrays import Array, Indices, Mask
 from starid.errors import StaridError
-from starid.imaging.background import BLOCK_PX
+from starid.imaging.background import BLOCK_PX, estimate_background
 from starid.imaging.detection import Detections, DetectionSettings, detect
 
 TILE_PX: Final = 2 * BLOCK_PX
@@ -25,6 +25,9 @@ MAX_RADIUS_PX: Final = BLOCK_PX / 2.0
 
 _RIVAL_SHARE: Final = 0.4
 """Flux from which another detection is like a star, as a share of the star's: a magnitude."""
+
+_UNEVEN_SIGMA: Final = 1.0
+"""Difference of the background in the quarters of a tile, in sigmas of a pixel, from which it is not smooth."""
 
 _MIN_EDGE_PX: Final = 8
 """Places nearer to the edge of the image are left out: the windows of their stars would extend into other tiles."""
@@ -41,7 +44,8 @@ def detect_near(
         Stars within `radius_px` of a place, each once, brightest first. Trails are not followed.
     rivals : ndarray (n,)
         Other detections around the places, at most a magnitude fainter, per square pixel and summed over the places: times an
-        area, the mean number of such detections that lie by chance in windows of that area.
+        area, the mean number of such detections that lie by chance in windows of that area. Where the background is uneven, as at
+        the edge of a body, they are counted apart.
     """
     if not 0.0 < radius_px <= MAX_RADIUS_PX:
         raise StaridError(f"radius_px: must be above 0 and at most {MAX_RADIUS_PX:g}, not {radius_px:g}")
@@ -65,8 +69,9 @@ def detect_near(
     for number in range(rows * columns):  # the last row is filled up with the first tiles
         x, y = corners[number % used.size]
         mosaic[row[number], :, column[number]] = image[y : y + TILE_PX, x : x + TILE_PX]
-    quiet = dataclasses.replace(settings, follow_trails=False)
-    found = detect(mosaic.reshape(rows * TILE_PX, columns * TILE_PX), quiet)
+    quiet = dataclasses.replace(settings, follow_trails=False, block_px=BLOCK_PX)
+    mosaic = mosaic.reshape(rows * TILE_PX, columns * TILE_PX)
+    found = detect(mosaic, quiet)
     at = np.clip(np.floor((found.xy_px + 0.5) / TILE_PX).astype(np.int64), 0, (columns - 1, rows - 1))
     tile = at[:, 1] * columns + at[:, 0]
     first = tile < used.size
@@ -76,7 +81,9 @@ def detect_near(
     around = first & (distance <= MAX_RADIUS_PX)
     off = xy[:, None, :] - places[None, :, :]
     elsewhere = around & ~(np.einsum("nmk,nmk->nm", off, off) <= radius_px * radius_px).any(axis=1)
-    count = np.count_nonzero(elsewhere & (found.flux >= _RIVAL_SHARE * found.flux[:, None]), axis=1)
+    uneven = _uneven_tiles(mosaic, (rows, columns))[tile]
+    alike = (found.flux >= _RIVAL_SHARE * found.flux[:, None]) & (uneven == uneven[:, None])
+    count = np.count_nonzero(elsewhere & alike, axis=1)
     rivals = count / (np.pi * (MAX_RADIUS_PX**2 - radius_px**2))
     near = np.flatnonzero(around & (distance <= radius_px))
     near = near[np.argsort(distance[near], kind="stable")]
@@ -84,6 +91,14 @@ def detect_near(
     _, once = np.unique(pixel[:, 1] * width + pixel[:, 0], return_index=True)
     kept = np.sort(near[once])
     return _chosen(found, xy, kept), rivals[kept]
+
+
+def _uneven_tiles(mosaic: npt.NDArray[np.generic], shape: tuple[int, int]) -> Mask:
+    """Whether the background of each tile (n,) differs between its quarters by more than the noise of a pixel."""
+    background = estimate_background(mosaic, BLOCK_PX)
+    quarters = background.level.reshape(shape[0], 2, shape[1], 2)
+    noise = background.noise.reshape(quarters.shape).max(axis=(1, 3))
+    return np.asarray((np.ptp(quarters, axis=(1, 3)) > _UNEVEN_SIGMA * noise).ravel())
 
 
 def _chosen(found: Detections, xy: Array, kept: Indices) -> Detections:
