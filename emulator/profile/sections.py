@@ -104,7 +104,7 @@ class DeviceConfig(Strict):
     tracking_stars: Literal[0] | Annotated[int, Field(ge=2, le=50)] = 2
     """Least number of matched stars in tracking, where the predicted attitude verifies few stars, which may then be fainter
     (3 sigmas). 0: `min_stars_matched`, as lost in space."""
-    tracking_error_deg: Annotated[float, Field(ge=0.001, le=10.0)] = 0.4
+    tracking_error_deg: Annotated[float, Field(ge=0.001, le=10.0)] = 0.1
     """Largest error of an attitude by few stars that may go unnoticed if the predicted attitude is wrong by many times its
     uncertainty, degrees. Smaller values reject more frames with a mostly covered field."""
     tracking_windows: bool = False

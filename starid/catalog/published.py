@@ -50,7 +50,7 @@ def with_missing_stars(columns: dict[str, Array]) -> dict[str, Array]:
     if not stars:
         return columns
     years = (EPOCH - 2000.0) * _RAD_PER_MAS
-    added = {
+    added: dict[str, list[float]] = {
         "hip": [star.hip for star in stars],
         "ra_rad": [
             math.radians(s.ra_deg) + years * s.pm_ra_mas_yr / math.cos(math.radians(s.dec_deg)) for s in stars
@@ -63,4 +63,6 @@ def with_missing_stars(columns: dict[str, Array]) -> dict[str, Array]:
         "b_v": [star.b_v for star in stars],
         "v_i": [math.nan for _ in stars],
     }
-    return {name: np.append(values, added[name]) for name, values in columns.items()}
+    return {
+        name: np.concatenate([values, np.array(added[name], np.float64)]) for name, values in columns.items()
+    }

@@ -105,7 +105,7 @@ class PipelineSetup:
     exact."""
     tracking_stars: int = 2
     """Least number of stars in tracking if the error of the prediction is known; 0: as lost in space."""
-    tracking_error_rad: float = math.radians(0.4)
+    tracking_error_rad: float = math.radians(0.1)
     """Largest error that few stars may leave unnoticed if the prediction is wrong, radians."""
     tracking_windows: bool = False
     """Whether to search only windows around predicted stars first, when tracking."""

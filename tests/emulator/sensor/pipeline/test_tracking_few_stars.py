@@ -39,7 +39,7 @@ def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Pipeline, "_expose", hidden)
     device, as_lost = (
-        EcssDevice(EcssPlan("cubestar")),
+        EcssDevice(EcssPlan("cubestar", ("device.tracking_error_deg=0.4",))),
         EcssDevice(EcssPlan("cubestar", ("device.tracking_stars=0",))),
     )
     lost = tracked = 0
