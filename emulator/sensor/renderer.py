@@ -387,7 +387,7 @@ def _falloff(camera: Camera, power: int) -> Array32:
     rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
     directions = camera.back_project(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
     cosine = np.maximum(directions[:, 2], 0.0).reshape(camera.height, camera.width)
-    return np.prod([cosine] * power, axis=0).astype(np.float32)
+    return np.asarray(np.prod([cosine] * power, axis=0), dtype=np.float32)
 
 
 def render(

@@ -10,9 +10,8 @@ import dataclasses
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-from starid.arrays import Array, Indices, Mask
+from starid.arrays import Array, GreyImage, Indices, Mask
 from starid.errors import StaridError
 from starid.imaging.background import BLOCK_PX, estimate_background
 from starid.imaging.detection import Detections, DetectionSettings, detect
@@ -34,7 +33,7 @@ _MIN_EDGE_PX: Final = 8
 
 
 def detect_near(
-    image: npt.NDArray[np.generic], places: Array, radius_px: float, settings: DetectionSettings
+    image: GreyImage, places: Array, radius_px: float, settings: DetectionSettings
 ) -> tuple[Detections, Array]:
     """Find the stars near places (m, 2) of an image (h, w).
 
@@ -93,7 +92,7 @@ def detect_near(
     return _chosen(found, xy, kept), rivals[kept]
 
 
-def _uneven_tiles(mosaic: npt.NDArray[np.generic], shape: tuple[int, int]) -> Mask:
+def _uneven_tiles(mosaic: GreyImage, shape: tuple[int, int]) -> Mask:
     """Whether the background of each tile (n,) differs between its quarters by more than the noise of a pixel."""
     background = estimate_background(mosaic, BLOCK_PX)
     quarters = background.level.reshape(shape[0], 2, shape[1], 2)
