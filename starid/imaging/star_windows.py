@@ -64,12 +64,12 @@ def detect_near(
         np.rint(places[used]).astype(np.int64) - TILE_PX // 2, 0, (width - TILE_PX, height - TILE_PX)
     )
     row, column = np.divmod(np.arange(rows * columns), columns)
-    mosaic = np.empty((rows, TILE_PX, columns, TILE_PX), dtype=image.dtype)
+    tiles = np.empty((rows, TILE_PX, columns, TILE_PX), dtype=image.dtype)
     for number in range(rows * columns):  # the last row is filled up with the first tiles
         x, y = corners[number % used.size]
-        mosaic[row[number], :, column[number]] = image[y : y + TILE_PX, x : x + TILE_PX]
+        tiles[row[number], :, column[number]] = image[y : y + TILE_PX, x : x + TILE_PX]
     quiet = dataclasses.replace(settings, follow_trails=False, block_px=BLOCK_PX)
-    mosaic = mosaic.reshape(rows * TILE_PX, columns * TILE_PX)
+    mosaic = tiles.reshape(rows * TILE_PX, columns * TILE_PX)
     found = detect(mosaic, quiet)
     at = np.clip(np.floor((found.xy_px + 0.5) / TILE_PX).astype(np.int64), 0, (columns - 1, rows - 1))
     tile = at[:, 1] * columns + at[:, 0]
