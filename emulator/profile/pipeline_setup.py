@@ -34,7 +34,7 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
     """Return the pipeline configuration of a profile; `repeatable`: results independent of machine speed."""
     path = profile.catalog.path
     return PipelineSetup(
-        camera=profile.camera.values(),
+        camera=profile.camera_values,
         sensor=dict(profile.sensor),
         sky=dict(profile.sky),
         identifier=dict(profile.identifier),

@@ -68,9 +68,11 @@ class CameraConfig(Strict):
     height: Annotated[int, Field(ge=64, le=4096)] = 937
     """Rows of the pixel array."""
     fov_deg: Annotated[float, Field(ge=1.0, le=120.0)] | None = None
-    """Field of view along a row, edge to edge; 42 if neither this nor `focal_px` is given."""
+    """Field of view along a row, edge to edge; 42 if no focal length is given."""
     focal_px: Annotated[list[FocalLength], Field(min_length=2, max_length=2)] | None = None
     """Focal length along x and y, instead of `fov_deg`."""
+    focal_mm: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = None
+    """Focal length, instead of `fov_deg`, for pixels of `sensor.pixel_um`."""
     centre_px: Annotated[list[PixelPosition], Field(min_length=2, max_length=2)] | None = None
     """Position of the optical axis on the pixel array; default: the centre."""
     model: Literal["pinhole", "equidistant", "flat"] = "pinhole"
@@ -78,9 +80,12 @@ class CameraConfig(Strict):
     distortion: list[DistortionTerm] = Field(default_factory=list, max_length=5)
     """Brown–Conrady coefficients k1, k2, p1, p2, k3."""
 
-    def values(self) -> dict[str, Any]:
-        """Return the keys that `starid.camera.Camera.from_dict` reads."""
+    def values(self, pixel_um: float) -> dict[str, Any]:
+        """Return the keys that `starid.camera.Camera.from_dict` reads, for pixels of this width."""
         values = self.model_dump(exclude_none=True)
+        if self.focal_mm is not None:
+            focal_px = 1000.0 * values.pop("focal_mm") / pixel_um
+            values["focal_px"] = [focal_px, focal_px]
         if "focal_px" not in values:
             values.setdefault("fov_deg", 42.0)
         return values

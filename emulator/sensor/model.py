@@ -137,6 +137,19 @@ class SensorModel:
         exposure = self.exposure_s if exposure_s is None else exposure_s
         return self.zero_magnitude_e_s * exposure * math.pow(10.0, -0.4 * magnitude)
 
+    def faintest_magnitude(self, pixel_scale_rad: float, threshold: float) -> float:
+        """Return the magnitude of a star whose signal in the matched filter is `threshold` standard deviations of the noise.
+
+        That is the magnitude at which about half of the stars are found: electrons = threshold·σ·√(4π s²), with the noise σ of
+        a pixel and the mean width s of a spot, that of the pixel included.
+        """
+        dark_e_s = self.dark_e_s * self.dark_factor(self.temperature_c)
+        light = (self.sky_e_s(pixel_scale_rad) + dark_e_s) * self.exposure_s
+        noise_e = math.sqrt(light + self.read_noise_e**2 + self.gain_e_per_dn**2 / 12.0)
+        spot_px = math.hypot(self.psf_sigma_px * (1.0 + self.psf_growth / 3.0), 1.0 / math.sqrt(12.0))
+        electrons = threshold * noise_e * math.sqrt(4.0 * math.pi) * spot_px
+        return -2.5 * math.log10(electrons / (self.zero_magnitude_e_s * self.exposure_s))
+
     def sky_e_s(self, pixel_scale_rad: float) -> float:
         """Return electrons/s per pixel from the sky background, for pixels of width `pixel_scale_rad`."""
         arcsec2 = pixel_scale_rad**2 * ARCSEC2_PER_SR
