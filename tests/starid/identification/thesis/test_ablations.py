@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import numpy as np
 import pytest
 from scipy.stats import binom, fisher_exact, wilcoxon
 
-from starid.attitude import Attitude, propagate, random_attitude
+from starid.attitude import propagate, random_attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.catalog import load_catalog
-from starid.identification.thesis.feature_search import FeatureSearch
+from starid.errors import StaridError
 from starid.identification.thesis.lsi_identifier import LsiIdentifier
 from starid.identification.thesis.rsi_identifier import RsiIdentifier
+from starid.lab.ablations import checked_part, without
 
 ZERO_POINT = 20.3
 LIMIT = 6.0
@@ -31,6 +31,8 @@ AMONG_FALSE_STARS = 0.91
 FROM_REGION = 1.0 - 0.22
 """Share of frames answered from the region: the thesis searches the whole database in at most 22 % (table 6.7)."""
 IMAGES = 90
+SEQUENCES = 60
+"""Sequences of ten images, of which the last is compared: independent of each other."""
 FEATURES_ALONE = 0.99
 """Share of the images of `ideal` for which features alone give an attitude, right or wrong, of 200 images."""
 STATED_SQUARES = (0.7, 1.0)
@@ -55,6 +57,12 @@ def image(rng, attitude, false_stars=0):
 def identifier(kind, refinement, filter_false_stars=True):
     options = {"filter_false_stars": filter_false_stars} if kind is RsiIdentifier else {}
     return kind(refinement=refinement, **SENSOR, **options)
+
+
+@functools.cache
+def thesis_sensor():
+    """The features alone with the options of profile `thesis`."""
+    return RsiIdentifier(refinement=False, feature_limit=3.8, overlap=0.995, **SENSOR)
 
 
 def lost_in_space(refinement=True, images=FRAMES):
@@ -107,63 +115,30 @@ def costs(intact, ablated):
     return ablated <= (1.0 - COST) * intact and fisher_exact(table, alternative="greater").pvalue < CHANCE
 
 
-def of_another_image(method):
-    """The method of a search with the stars of the image before, so that features do not belong to the image."""
-    last = []
-
-    def with_last(self, field):
-        last.append(field)
-        return method(self, last[-2] if len(last) > 2 else field)
-
-    return with_last
-
-
-def test_features_of_another_image_find_nothing(monkeypatch):
+def test_features_of_another_image_find_nothing():
     intact = valid_count(lost_in_space())
     assert intact >= least(LOST_IN_SPACE)
-    for name in ("features", "doubtful_features"):
-        monkeypatch.setattr(FeatureSearch, name, of_another_image(getattr(FeatureSearch, name)))
-    assert costs(
-        intact, valid_count(lost_in_space())
-    )  # the neighbours of any features cover a part of the sky
+    with without("features"):
+        ablated = valid_count(lost_in_space())
+    assert costs(intact, ablated)  # the neighbours of any features cover a part of the sky
 
 
-def test_features_of_another_part_of_the_sky_leave_the_region_useless(monkeypatch):
+def test_features_of_another_image_leave_the_region_useless():
     valid, in_region = slew(0.5)
     assert in_region >= least(FROM_REGION)
-    elsewhere = identifier(LsiIdentifier, True).search.field_stars(  # noqa: FBT003
-        *image(np.random.default_rng(5), Attitude.from_radec_roll(266.0, -29.0, 0.0)), ZERO_POINT
-    )
-    features, doubtful = FeatureSearch.features, FeatureSearch.doubtful_features
-    monkeypatch.setattr(FeatureSearch, "features", lambda self, _field: features(self, elsewhere))
-    monkeypatch.setattr(FeatureSearch, "doubtful_features", lambda self, _field: doubtful(self, elsewhere))
-    ablated, ablated_in_region = slew(0.5)
+    with without("features"):
+        ablated, ablated_in_region = slew(0.5)
     assert costs(in_region, ablated_in_region)
     assert costs(valid_count(valid), valid_count(ablated))
 
 
-def test_shuffled_weights_of_the_lasso_cost_accuracy(monkeypatch):
+def test_shuffled_weights_of_the_lasso_cost_accuracy():
     ordered = lost_in_space(refinement=False, images=200)
     right = ordered < RIGHT_DEG
-    answer = FeatureSearch._answer
-    rng = np.random.default_rng(7)
-
-    def shuffled(self, solution, features):
-        weights = solution.weights[:, rng.permutation(9)]
-        places = np.radians([self.database.grid.centre(cell) for cell in solution.cells.tolist()])
-        ra, dec = places.T
-        directions = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-        results = solution.results.copy()
-        results[:, 6:9] = weights @ directions
-        results[:, 6:9] /= np.linalg.norm(results[:, 6:9], axis=1)[:, None]
-        results[:, 9:12] -= results[:, 6:9] * np.sum(results[:, 6:9] * results[:, 9:12], axis=1)[:, None]
-        results[:, 9:12] /= np.linalg.norm(results[:, 9:12], axis=1)[:, None]
-        return answer(self, dataclasses.replace(solution, weights=weights, results=results), features)
-
-    monkeypatch.setattr(FeatureSearch, "_answer", shuffled)
-    ablated = lost_in_space(refinement=False, images=200)
-    assert np.median(ablated[right]) >= np.median(ordered[right]) / (1.0 - COST)
-    assert wilcoxon(ordered[right], ablated[right], alternative="less").pvalue < CHANCE
+    with without("weights"):
+        shuffled = lost_in_space(refinement=False, images=200)
+    assert np.median(shuffled[right]) >= np.median(ordered[right]) / (1.0 - COST)
+    assert wilcoxon(ordered[right], shuffled[right], alternative="less").pvalue < CHANCE
 
 
 def test_without_the_filter_twenty_false_stars_cost_attitudes():
@@ -174,18 +149,46 @@ def test_without_the_filter_twenty_false_stars_cost_attitudes():
     assert costs(in_region, unfiltered_in_region)
 
 
-def test_a_reversed_motion_loses_the_region(monkeypatch):
+@pytest.mark.parametrize("part", ["motion", "region"])
+def test_without_motion_or_region_nothing_is_found_in_the_region(part):
     _, in_region = slew(2.0)
     assert in_region >= least(FROM_REGION)
-    preprocess = RsiIdentifier._preprocess
-
-    def reversed_motion(self, xy, flux):
-        known = preprocess(self, xy, flux)
-        return known if known.rotation is None else dataclasses.replace(known, rotation=known.rotation.T)
-
-    monkeypatch.setattr(RsiIdentifier, "_preprocess", reversed_motion)
-    _, ablated = slew(2.0)
+    with without(part):
+        _, ablated = slew(2.0)
     assert costs(in_region, ablated)
+
+
+@pytest.mark.parametrize("part", ["motion", "region"])
+def test_without_motion_or_region_the_features_alone_state_a_larger_error(part):
+    """What the region is worth to the features alone: agreement with the motion is evidence of the right place."""
+    intact = stated_deg(2.0)
+    with without(part):
+        ablated = stated_deg(2.0)
+    assert np.median(ablated) >= np.median(intact) / (1.0 - COST)
+    assert wilcoxon(intact, ablated, alternative="less").pvalue < CHANCE
+
+
+def stated_deg(rate_deg):
+    """Stated errors of the boresight, degrees, in the last images of sequences, by features alone."""
+    rsi = thesis_sensor()
+    stated = []
+    for seed in range(SEQUENCES):
+        rng = np.random.default_rng((44, seed))
+        attitude = random_attitude(rng)
+        rsi.reset()
+        solution = rsi.identify(*image(rng, attitude))
+        for _ in range(9):
+            attitude = propagate(attitude, np.radians([0.0, rate_deg, 0.0]), 1.0)
+            solution = rsi.track(*image(rng, attitude), attitude)
+        stated.append(solution.cross_boresight_sigma_arcsec / 3600.0 if solution.valid else 180.0)
+    return np.array(stated)
+
+
+def test_an_unknown_part_is_rejected():
+    with pytest.raises(StaridError, match="no part 'sky'; there are features, weights, motion, region"):
+        checked_part("sky")
+    assert checked_part(None) is None
+    assert checked_part("region") == "region"
 
 
 @pytest.mark.parametrize("algorithm", [LsiIdentifier, RsiIdentifier])
