@@ -23,8 +23,8 @@ from starhil.emulator.truth.source import TruthState
 from starid.arrays import Indices, Mask
 from starid.attitude import Attitude, propagate, random_attitude, rate_between
 from starid.identification.solution import Solution
+from starid.identification.thesis.ablations import Part, without
 from starid.imaging.detection import Detections
-from starid.lab.ablations import Part, without
 
 WRONG_DEG: Final = 0.1
 """Error in boresight or roll beyond which a refined attitude is wrong, degrees."""

@@ -350,7 +350,7 @@ def algorithms(
     is wrong.
     """
     from starhil.emulator.benchmarks.algorithms import SCENES, AlgorithmPlan, run_algorithms
-    from starid.lab.ablations import checked_part
+    from starid.identification.thesis.ablations import checked_part
 
     plan = AlgorithmPlan(profile, frames, seed, tuple(with_orbit(setting, orbit)), checked_part(part))
     scenes = SCENES[:1] if lost_only else tuple(each for each in SCENES if (scene or "") in each.name)

@@ -12,9 +12,9 @@ from starid.attitude import propagate, random_attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.catalog import load_catalog
 from starid.errors import StaridError
+from starid.identification.thesis.ablations import checked_part, without
 from starid.identification.thesis.lsi_identifier import LsiIdentifier
 from starid.identification.thesis.rsi_identifier import RsiIdentifier
-from starid.lab.ablations import checked_part, without
 
 ZERO_POINT = 20.3
 LIMIT = 6.0
