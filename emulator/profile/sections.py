@@ -106,6 +106,14 @@ class DeviceConfig(Strict):
     """Time in boot mode after a start or reset, in simulation time."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Number of valid frames from which the body rate is estimated, if the star identifier does not do so."""
+    tracking_stars: Literal[0] | Annotated[int, Field(ge=2, le=50)] = 2
+    """Least number of matched stars in tracking, where the predicted attitude verifies few stars, which may then be fainter
+    (3 sigmas). 0: `min_stars_matched`, as lost in space."""
+    tracking_error_deg: Annotated[float, Field(ge=0.001, le=10.0)] = 0.1
+    """Largest error of an attitude by few stars that may go unnoticed if the predicted attitude is wrong by many times its
+    uncertainty, degrees. Smaller values reject more frames with a mostly covered field."""
+    tracking_windows: bool = False
+    """Whether the unit searches only windows around the predicted stars when it tracks, and the whole image only if that fails."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
     """Number of frames averaged into the dark frame that the unit subtracts from each image; 0: none."""
 
