@@ -486,6 +486,7 @@ _INERT_ACTIONS: Final = frozenset(
         "nothing",
         "reset",
         "save_image",
+        "convert_image",
         "open_image",
         "load_image_chunk",
         "load_file_block",
