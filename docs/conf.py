@@ -37,6 +37,8 @@ napoleon_google_docstring = False
 napoleon_use_rtype = False
 napoleon_use_ivar = True
 
+ROOT = Path(__file__).resolve().parents[1]
+
 LINKS = {
     "docs/": "",
     "CONTRIBUTING.md": "contributing.md",
@@ -50,10 +52,25 @@ LINKS = {
 def put_readme_first(_app: Sphinx, page: str, source: list[str]) -> None:
     """Begin the front page with the README, with its links pointing to the pages here."""
     if page == "index":
-        text = (Path(__file__).resolve().parent.parent / "README.md").read_text(encoding="utf-8")
+        text = (ROOT / "README.md").read_text(encoding="utf-8")
         for there, here in LINKS.items():
             text = text.replace(f"]({there}", f"]({here}")
         source[0] = f"{text}\n{source[0]}"
+
+
+def copy_interfaces(_app: Sphinx) -> None:
+    """Put the interface definitions, which stand beside their units, among the pages."""
+    (ROOT / "docs/icd").mkdir(exist_ok=True)
+    for file in (ROOT / "configs/units").glob("*/icd.md"):
+        (ROOT / "docs/icd" / f"{file.parent.name}.md").write_bytes(file.read_bytes())
+
+
+def put_tables(_app: Sphinx, _page: str, source: list[str]) -> None:
+    """Put the reference tables in their places, and let links to interface definitions lead to the copies."""
+    from starhil.emulator.cli.reference import with_built_tables
+
+    text = re.sub(r"\]\((?:\.\./)?configs/units/([\w-]+)/icd\.md", r"](icd/\1.md", source[0])
+    source[0] = with_built_tables(text)
 
 
 ARRAY = re.compile(r"~numpy\.ndarray\[tuple\[~typing\.Any, \.\.\.\], ~numpy\.dtype\[(~[\w.]+)\]\]")
@@ -83,4 +100,6 @@ def setup(app: Sphinx) -> None:
     """Connect what this file adds."""
     app.connect("autodoc-process-signature", shorten_array_types)
     app.connect("autodoc-process-docstring", keep_whole_sentences, priority=600)
+    app.connect("builder-inited", copy_interfaces)
     app.connect("source-read", put_readme_first)
+    app.connect("source-read", put_tables)

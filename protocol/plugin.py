@@ -13,7 +13,7 @@ Example of `unit.py` beside the TOML files of a unit with `plugin = "unit.py"` i
         device.reset("command")
 
 The function of a quantity gets a `starhil.emulator.device.snapshot.Snapshot`: the device at one moment, from which the
-whole row is packed. It has access to neither the device nor a clock. docs/quantities.md lists the fields of a snapshot.
+whole row is packed. It has access to neither the device nor a clock. `emulator/device/snapshot.py` has the fields of a snapshot.
 The function of an action gets the device, and the arguments by name. It returns nothing, messages that follow the answer,
 or `bytes`, the data of the answer; a list of `bytes` makes several answers.
 A framing is a class derived from `starhil.protocol.serial.framings.Framing`, whose constructor takes no arguments; a

@@ -38,14 +38,15 @@ from starhil.protocol.can.cubespace import MessageType
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.export import export
+from starhil.protocol.files.bundled import bundled_units
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from tests.emulator.cli.command_line import run_command_line
+from tests.waiting import PATIENCE_S
 
 DOCS = Path(__file__).parents[1] / "docs"
-PATIENCE_S = 20.0
 UNASKED = {0x0CE60401, 0x185}
 """Unsolicited telemetry, and the status that a change of mode sends: they may come between any two frames."""
 _FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -64,7 +65,7 @@ class Block:
 def blocks(name: str, language: str = "") -> list[Block]:
     text = (DOCS / name).read_text(encoding="utf-8")
     return [
-        Block(match[1], match[2], re.findall(r"^##+ (.*)$", text[: match.start()], re.MULTILINE)[-1])
+        Block(match[1], match[2], re.findall(r"^#+ (.*)$", text[: match.start()], re.MULTILINE)[-1])
         for match in _FENCE.finditer(text)
         if language in ("", match[1])
     ]
@@ -117,9 +118,11 @@ def test_the_library_example_of_the_readme_prints_the_attitude_of_its_image(tmp_
     assert run(program, {}) == "True RA 83.80, Dec -1.20\n"
 
 
-def test_icd_is_the_present_export():
-    remedy = "docs/icd.md is out of date; run: starhil icd export markdown -o docs/icd.md"
-    assert (DOCS / "icd.md").read_text(encoding="utf-8") == export(load_unit(), "markdown"), remedy
+@pytest.mark.parametrize("name", bundled_units())
+def test_the_interface_definition_beside_a_unit_is_its_present_export(name):
+    file = DOCS.parent / "configs" / "units" / name / "icd.md"
+    remedy = f"{file} is out of date; run: python tools/make_reference.py"
+    assert file.read_text(encoding="utf-8") == export(load_unit(name), "markdown"), remedy
 
 
 def table_after(name: str, heading: str) -> list[list[str]]:
@@ -373,7 +376,7 @@ def test_walkthrough_by_steps(tmp_path):
     emulator = EmulatorProcess(command).start()
     try:
         check_program("Time by steps", emulator.ready, tmp_path)
-        assert emulator.process.wait(60) == 0  # the program ends it
+        assert emulator.process.wait(PATIENCE_S) == 0  # the program ends it
     finally:
         emulator.kill()
 
@@ -390,7 +393,7 @@ def test_walkthrough_pytest(unit, tmp_path):
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--rootdir={tmp_path}", str(file),
          "--starhil-can", unit["can"]],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120,
+        cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout
     assert f"{block.text.count('def test_')} passed" in done.stdout

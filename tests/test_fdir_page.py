@@ -12,6 +12,7 @@ import pytest
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.telemetry_faults import EFFECTS, TelemetryFault
 from tests.test_docs import DOCS, blocks
+from tests.waiting import PATIENCE_S
 
 PAGE = "fdir.md"
 
@@ -31,7 +32,7 @@ def test_the_session_passes(tmp_path):
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -41,7 +42,7 @@ def test_the_pytest_matrix_passes(tmp_path):
     (tmp_path / "test_fdir.py").write_text(example("test_fdir.py"))
     command = ["-m", "pytest", "-q", "-p", "no:cacheprovider", f"--rootdir={tmp_path}", "test_fdir.py"]
     done = subprocess.run(
-        [sys.executable, *command], cwd=tmp_path, capture_output=True, text=True, timeout=300
+        [sys.executable, *command], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S
     )
     assert "6 passed" in done.stdout, done.stdout + done.stderr
 

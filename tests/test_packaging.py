@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.waiting import PATIENCE_S
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -26,7 +28,7 @@ def test_the_installed_version_matches_the_project():
 def test_the_command_prints_the_version():
     done = subprocess.run(
         [sys.executable, "-c", "from starhil.emulator.cli import main; main()", "--version"],
-        capture_output=True, text=True, timeout=120, check=True,
+        capture_output=True, text=True, timeout=PATIENCE_S, check=True,
     )  # fmt: skip
     assert done.stdout == f"starhil {project_version()}\n"
 

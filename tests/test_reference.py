@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import re
 import socket
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
+from starhil.emulator.cli import reference
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.profile import load_profile
 from starhil.hil_tests.errors import ScriptError
@@ -18,6 +17,7 @@ from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_com
 from starhil.hil_tests.session.script import load_script
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -38,17 +38,8 @@ WHOLE_ACTIONS = {
 """A step of each action, without the keys that may be left out."""
 
 
-@pytest.fixture(scope="module")
-def reference() -> ModuleType:
-    """tools/make_reference.py as a module."""
-    spec = importlib.util.spec_from_file_location("make_reference", ROOT / "tools" / "make_reference.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_the_tables_of_the_reference_pages_match_the_code(reference):
-    pages = reference.pages()
+def test_the_tables_of_the_reference_pages_match_the_code():
+    pages = [page for page in DOCS.glob("*.md") if reference.BLOCK.search(page.read_text(encoding="utf-8"))]
     assert {"cli.md", "control.md", "profile.md"} <= {page.name for page in pages}
     for page in pages:
         text = page.read_text(encoding="utf-8")
@@ -57,9 +48,24 @@ def test_the_tables_of_the_reference_pages_match_the_code(reference):
         )
 
 
-def test_every_table_that_can_be_written_stands_on_a_page(reference):
-    text = "".join(page.read_text(encoding="utf-8") for page in reference.pages())
-    assert set(re.findall(r"^(?:<!--|#) begin: (\w+)", text, re.MULTILINE)) == set(reference.TABLES)
+def test_every_table_that_can_be_written_stands_on_a_page():
+    text = "".join(page.read_text(encoding="utf-8") for page in DOCS.glob("*.md"))
+    assert set(re.findall(r"^<!-- (?:begin|built): (\w+)", text, re.MULTILINE)) == set(reference.TABLES)
+
+
+@pytest.mark.parametrize(
+    ("page", "entries"),
+    [
+        ("cli", ["| `--truth-log` |", "starid identify [options] IMAGE"]),
+        ("quantities", ["| `attitude.sigma_cross` |", "| `set_clock` |", "| `exposure` |", "### `Snapshot`"]),
+        ("units", ["| `scalar_sign` |", '### `check = { kind = "crc" }`']),
+    ],
+)
+def test_starhil_docs_prints_the_tables_that_the_files_lack(page, entries):
+    status, printed, said = run_command_line("docs", page)
+    assert (status, said) == (0, "")
+    assert [entry for entry in entries if entry not in printed] == []
+    assert "<!-- built" not in printed
 
 
 @pytest.mark.parametrize(
@@ -198,7 +204,7 @@ def test_the_control_channel_answers_as_the_page_shows():
     assert len(pairs) == 2
     command = emulator_command(extra=["--control", "auto", "--clock", "stepped"])
     with EmulatorProcess(command) as emulator, socket.socket(socket.AF_UNIX) as channel:
-        channel.settimeout(30)
+        channel.settimeout(PATIENCE_S)
         channel.connect(emulator.ready["control"].removeprefix("unix:"))
         lines = channel.makefile("rw")
         for request, answer in pairs:

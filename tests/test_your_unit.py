@@ -18,6 +18,7 @@ from starhil.protocol.unit import load_unit
 from tests.emulator.conftest import FakePipeline
 from tests.emulator.runs import FakeImager
 from tests.test_docs import blocks, programs, run
+from tests.waiting import PATIENCE_S
 
 PAGE = "your-unit.md"
 STREAMING = "A unit that streams by itself"
@@ -112,7 +113,7 @@ def test_the_unit_of_the_page_streams_by_itself(tmp_path, monkeypatch):
     profile = Profile.model_validate({"unit": str(folder), "links": {"can": {"channel": "off"}}})
 
     def listen(port: str) -> bytes:
-        with serial.Serial(port, timeout=10.0) as line:
+        with serial.Serial(port, timeout=PATIENCE_S) as line:
             return line.read(400)
 
     async def read() -> bytes:

@@ -243,7 +243,7 @@ def boot(
         stdout=console,
         stderr=console,
         pass_fds=(console.fileno(), *streams),
-        start_new_session=True,
+        process_group=0,  # of this session, whose processes give way to each other by their niceness
     )
     try:
         for limit_s in (min(BOOT_S, time_out_s), max(time_out_s - BOOT_S, 0.0)):

@@ -34,6 +34,7 @@ from starid.identification.solution import Solution
 from starid.identification.star_identifier import StarIdentifier, make_identifier
 from starid.imaging.detection import detect
 from starid.photograph.field_sweep import FieldSweep
+from starid.storage.child_processes import importing_only_what_is_installed
 from starid.storage.results import Results, ResultStore
 
 Plan = TypeVar("Plan")
@@ -266,10 +267,11 @@ def run_parts(
         else:
             yield name, kept
     work = (delayed(_run_named)(name, *call) for name, call in todo.items())
-    for name, results in Parallel(n_jobs=jobs, return_as="generator_unordered")(work):
-        if store is not None:
-            store.save(name, results)
-        yield name, results
+    with importing_only_what_is_installed():
+        for name, results in Parallel(n_jobs=jobs, return_as="generator_unordered")(work):
+            if store is not None:
+                store.save(name, results)
+            yield name, results
 
 
 def _run_named(name: str, run: Callable[..., Results], *arguments: Any) -> tuple[str, Results]:

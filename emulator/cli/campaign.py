@@ -16,6 +16,7 @@ from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import Jobs, OrbitChoice, Seed, Settings, names_of, with_orbit
 from starid.cli.options import AsJson
 from starid.cli.output import Column, print_table
+from starid.storage.child_processes import importing_only_what_is_installed
 
 if TYPE_CHECKING:
     from starhil.emulator.benchmarks.campaign import CampaignPlan
@@ -276,7 +277,7 @@ def _backend(dask: str | None, jobs: int) -> Iterator[None]:
         ) from error
     from joblib import parallel_config
 
-    with ExitStack() as stack:
+    with importing_only_what_is_installed(), ExitStack() as stack:
         try:
             address = dask
             if dask == "local":

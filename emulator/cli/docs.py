@@ -65,4 +65,6 @@ def command(
     name = page.removeprefix("docs/").partition("#")[0].removesuffix(".md")
     if name not in texts:
         raise EmulatorError(f"page {page!r}: not found{remedy(name, texts)}")
-    print_text(_DIRECTIVES.sub(_with_docstrings, texts[name]))
+    from starhil.emulator.cli.reference import with_built_tables
+
+    print_text(with_built_tables(_DIRECTIVES.sub(_with_docstrings, texts[name])))

@@ -24,6 +24,7 @@ from starhil.emulator.cli.options import Jobs, names_of
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.files.bundled import bundled_units
 from starid.cli.options import AsJson
+from starid.storage.child_processes import importing_only_what_is_installed
 
 IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made there)
 """Folder for the state of the units, if there is one: a stored parameter then costs no time on a disk."""
@@ -77,22 +78,32 @@ def command(
     *,
     plan: PlanOptions,
     life: Annotated[
-        Path | None, typer.Option(help="Repeat one life, a file that an earlier run has written.")
+        Path | None,
+        typer.Option(
+            help="Repeat one life, a file that an earlier run has written, with the unit of --unit if given."
+        ),
     ] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Folder for lives that end in a violation.")
     ] = Path("out/endurance"),
     as_json: AsJson = False,
 ) -> None:
-    """Let units live random lives in simulated time; an oracle that knows only the bus judges them.
+    """Run units through random operation in simulated time, and check everything on the bus against an independent model.
 
-    Requests valid and invalid on every link, faults, resets, power cycles, full disks, tumbles. A life that ends in
-    a violation is shortened and written to -o as a life, a session and a recording. The exit status is 1 if
-    there is one.
+    Each run of a unit, a *life*, has valid and invalid requests on every link, faults, resets, power cycles, full disks and
+    tumbles. One that violates the interface definition is shortened and written to -o, with a session and a recording that
+    repeat it; the exit status is then 1.
     """
     if life is not None:
-        found = read_life(life)
-        outcomes = [{**live(found, output), "repeat": f"--life {shlex.quote(str(life))}"}]
+        from starhil.protocol.unit import check_runs_no_code
+
+        found, again = read_life(life), f"--life {shlex.quote(str(life))}"
+        if plan.unit:
+            (unit, *_) = plan.unit
+            found, again = replace(found, unit=unit), f"{again} --unit {shlex.quote(unit)}"
+        else:
+            check_runs_no_code(found.unit, f"--life {life}")
+        outcomes = [{**live(found, output), "repeat": again}]
     else:
         outcomes = list(_run(plan, output))
     figures = {"seed": plan.seed, **summary(outcomes)}
@@ -111,7 +122,8 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
 
     context = get_context("spawn")
     try:
-        context.Lock()
+        with importing_only_what_is_installed():
+            context.Lock()
     except OSError as error:
         raise EmulatorError(
             f"endurance: its processes need POSIX semaphores, which are not available ({error.strerror}): "
@@ -120,6 +132,7 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
     begin, lives = time.monotonic(), plan.plan()
     limit_s = None if plan.hours is None else plan.hours * 3600.0
     with (
+        importing_only_what_is_installed(),
         ProcessPoolExecutor(plan.jobs, mp_context=context) as pool,
         Progress(console=Console(stderr=True)) as progress,
     ):
@@ -254,7 +267,7 @@ def read_life(path: Path) -> Any:
         content = json.loads(read_user_text(path))
         links, steps = tuple(content["links"]), tuple(content["steps"])
         rendered = content.get("rendered", False) is True
-        return Life(content["unit"], content["seed"], links, content["profile"], steps, rendered)
+        return Life(str(content["unit"]), content["seed"], links, content["profile"], steps, rendered)
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise EmulatorError(f"{path}: not a life of `starhil endurance`: {error}") from None
 

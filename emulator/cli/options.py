@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeAlias
 
 import typer
 
-from starhil.protocol.files.bundled import Kind, bundled
+from starhil.protocol.files.bundled import Kind, bundled, bundled_units, find_unit
 from starid.cli.options import one_of
 from starid.cli.output import output_help
 
@@ -87,6 +87,18 @@ Jobs: TypeAlias = Annotated[int, typer.Option("--jobs", min=1, help="Number of p
 def with_orbit(settings: list[str] | None, orbit: str | None) -> list[str]:
     """Return the settings of a profile with those of `--orbit`."""
     return [*([] if orbit is None else [f"orbit={orbit}"]), *(settings or ())]
+
+
+def absolute_unit(unit: str) -> str:
+    """Return a unit from the command line, a folder as an absolute path; a profile would resolve it differently."""
+    return unit if unit in bundled_units() else str(find_unit(unit).absolute())
+
+
+def as_toml(value: str | float) -> str:
+    """Return a value in TOML, for `--set`."""
+    if isinstance(value, (int, float)):
+        return str(value)
+    return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
 
 
 DIALECTS = ("a", "b", "c")

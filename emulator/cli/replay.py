@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import OrbitChoice, Settings, names_of, with_orbit
+from starhil.emulator.cli.options import OrbitChoice, Settings, absolute_unit, as_toml, names_of, with_orbit
 from starid.cli.options import AsJson
 
 
@@ -21,6 +21,15 @@ def command(
             help="Device profile, a name or a TOML file, instead of the one in the recording; its tables `links` and `run`, except the "
             "algorithm, stay as recorded.",
             autocompletion=names_of("profile"),
+        ),
+    ] = None,
+    unit: Annotated[
+        str | None,
+        typer.Option(
+            "--unit",
+            help="Unit, a name or a folder, instead of the one that the recording or the profile names. A recorded unit with a "
+            "Python file is only replayed if you name it.",
+            autocompletion=names_of("unit"),
         ),
     ] = None,
     orbit: OrbitChoice = None,
@@ -42,8 +51,11 @@ def command(
     settings = with_orbit(overrides, orbit)
     if settings and profile is None:
         raise EmulatorError("--set and --orbit: change the profile given by --profile; give both")
+    named = None if unit is None else absolute_unit(unit)
+    if named is not None:
+        settings = [*settings, f"unit={as_toml(named)}"]
     changed = None if profile is None else load_profile(profile, settings)
-    report = asyncio.run(replay(folder, changed))
+    report = asyncio.run(replay(folder, changed, named))
     if as_json:
         print(json.dumps(dataclasses.asdict(report)))
     else:

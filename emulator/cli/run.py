@@ -19,6 +19,8 @@ from starhil.emulator.cli.options import (
     ProfileArgument,
     Settings,
     UnitChoice,
+    absolute_unit,
+    as_toml,
     checked_dialect,
     list_option,
     names_of,
@@ -27,7 +29,6 @@ from starhil.emulator.cli.options import (
 from starhil.emulator.cli.output import report_slow_start
 from starhil.emulator.console.recorders import RECORDERS
 from starhil.emulator.errors import EmulatorError
-from starhil.protocol.files.bundled import bundled_units, find_unit
 from starid.cli.output import output_help, prepare_output
 
 if TYPE_CHECKING:
@@ -55,16 +56,11 @@ def _symlink(path: Path, number: int) -> str:
     return str(path_of_head(path.absolute(), number))
 
 
-def _absolute_folder(unit: str, _number: int) -> str:
-    """Return a folder from the command line as an absolute path; a profile would resolve it differently."""
-    return unit if unit in bundled_units() else str(find_unit(unit).absolute())
-
-
 @dataclass(frozen=True)
 class DeviceOptions:
     """What replaces keys of the profile of every head; an option that names no key changes nothing."""
 
-    unit: Annotated[UnitChoice, Key("unit", _absolute_folder)] = None
+    unit: Annotated[UnitChoice, Key("unit", lambda unit, _number: absolute_unit(unit))] = None
     serial: Annotated[
         str | None,
         Key("links.serial.port"),
@@ -126,7 +122,7 @@ class DeviceOptions:
         from starhil.emulator.profile import load_profile
 
         overrides = [
-            f"{key.name}={_as_toml(key.value(value, number))}"
+            f"{key.name}={as_toml(key.value(value, number))}"
             for option, hint in get_type_hints(type(self), include_extras=True).items()
             for key in get_args(hint)
             if isinstance(key, Key) and (value := getattr(self, option)) is not None
@@ -308,8 +304,7 @@ async def _serve(make: Callable[[], Emulator]) -> int:
     for number in ends:
         loop.add_signal_handler(number, emulator.ended.set)
     try:
-        await emulator.start()
-        line = asyncio.create_task(emulator.ready())
+        line = asyncio.create_task(_started(emulator))
         stop = asyncio.create_task(emulator.ended.wait())
         progress = asyncio.create_task(report_slow_start())
         await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
@@ -321,9 +316,16 @@ async def _serve(make: Callable[[], Emulator]) -> int:
             await stop
         else:
             line.cancel()
+            await asyncio.wait({line})
     finally:
         await emulator.close()
     return int(emulator.failed)
+
+
+async def _started(emulator: Emulator) -> str:
+    """Start an emulator, wait until it is ready, and return the ready line."""
+    await emulator.start()
+    return await emulator.ready()
 
 
 def _by_format(paths: Sequence[Path]) -> dict[str, Path]:
@@ -336,9 +338,3 @@ def _by_format(paths: Sequence[Path]) -> dict[str, Path]:
             kind = f"{suffix[1:].upper()} file" if suffix else "folder"
             raise EmulatorError(f"--record {path}: one {kind} per run, and {other} is one already")
     return by_suffix
-
-
-def _as_toml(value: str | float) -> str:
-    if isinstance(value, (int, float)):
-        return str(value)
-    return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'

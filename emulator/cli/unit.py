@@ -90,7 +90,7 @@ def check(
 ) -> None:
     """Check a unit: list all errors, or show an example exchange of each row in hexadecimal.
 
-    This runs the unit's plugin, a Python file, if it has one: check the unit of a stranger with --no-plugin. The exit
+    This runs the unit's plugin, a Python file, if it has one: check a unit from elsewhere with --no-plugin. The exit
     status is 0 if there are no errors, otherwise 1.
     """
     from starhil.protocol.export.describe import value_text
@@ -158,6 +158,31 @@ def describe(unit: UnitArgument = DEFAULT_UNIT, as_json: AsJson = False) -> None
         for field in row.named_fields.values():
             unit_text = f" {field.unit}" if field.unit else ""
             print(f"    {field.offset:4d} {field.name}: {field.type}{unit_text}{_binding(field)}")
+
+
+@group.command("bindings")
+def bindings(as_json: AsJson = False) -> None:
+    """List what the rows of a unit can be bound to: quantities, actions and their arguments, and parameters."""
+    from starhil.protocol.icd.device_model import device_model
+
+    model = device_model()
+    if as_json:
+        kinds = {"quantities": model.quantities, "actions": model.actions, "parameters": model.parameters}
+        shown = {kind: [item.model_dump() for item in items.values()] for kind, items in kinds.items()}
+        print(json.dumps(shown))
+        return
+    for quantity in model.quantities.values():
+        print(_bound("value", quantity.name, quantity.unit, quantity.doc))
+    for action in model.actions.values():
+        print(_bound("action", action.name, "", action.doc))
+        for argument in action.arguments:
+            print(_bound("  argument", argument.name, argument.unit, argument.doc))
+    for parameter in model.parameters.values():
+        print(_bound("parameter", parameter.name, parameter.unit, parameter.doc))
+
+
+def _bound(key: str, name: str, unit: str, doc: str) -> str:
+    return f'{key} = "{name}"  {f"{unit}: " if unit else ""}{doc}'
 
 
 def _count(number: int, noun: str) -> str:

@@ -263,6 +263,10 @@ class Device:
         written.when_done(finish)
         return written
 
+    def write(self, work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
+        """Perform a write that may be slow, after those before it, and call `done` with its error or None in the event loop."""
+        self._background(work, done)
+
     def restore_parameters(self) -> None:
         """Set all parameters to their stored values, or to their defaults if none are stored."""
         self.parameters.restore(self._stored_parameters)
@@ -277,7 +281,7 @@ class Device:
         """Write the state to the store."""
         content, written = self._persistent_state(), PendingAnswer[EmulatorError | None]()
         written.when_done(lambda error: None if error is None else self.stored.fail(str(error)))
-        self._background(lambda: self.store.save(content), written.end)
+        self.write(lambda: self.store.save(content), written.end)
         return written
 
     def _persistent_state(self) -> dict[str, object]:

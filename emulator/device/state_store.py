@@ -20,6 +20,8 @@ from starhil.protocol.files.user_file import UnsuitableFileError, read_user_file
 
 FORMAT: Final = 1
 STATE_FILE: Final = "device.json"
+CANOPEN_FILE: Final = "canopen.json"
+"""Beside it, the parameters of a CANopen node, which `protocol.canopen.storage` writes."""
 LOCK_FILE: Final = "lock"
 MAX_BYTES: Final = 1_000_000
 

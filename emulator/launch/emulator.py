@@ -23,6 +23,7 @@ from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from starhil.emulator.simulation.clock import make_clock
 from starhil.emulator.simulation.guard import close_all
 from starhil.emulator.simulation.output_file import OutputFile
+from starhil.emulator.simulation.threads import in_thread
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,8 @@ class Emulator:
             run.heads[number - 1].device.signals.frame_published.connect(log.write)
         if scenario is not None:
             for head in run.heads:
-                events = scenario.prepare(head, run.truth if head.number == 1 else None)
+                truth = run.truth if head.number == 1 else None
+                events = await in_thread(scenario.prepare, head, truth)
                 head.device.scheduler.add(events)
                 head.foreseen += scenario.skies
         if options.control != "off" or options.console is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import shutil
@@ -13,6 +14,7 @@ from typing import Any, Final, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from starhil.emulator.control.scenario import load_scenario
+from starhil.emulator.device.state_store import CANOPEN_FILE, STATE_FILE
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.launch.machine import description
 from starhil.emulator.profile import Profile
@@ -22,7 +24,7 @@ from starhil.emulator.run.recorder import (
     SCENARIO_FILE,
     STATE_FOLDER,
 )
-from starhil.protocol.files.user_file import read_user_text
+from starhil.protocol.files.user_file import read_user_file, read_user_text
 from starhil.protocol.files.validation import problems
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -68,8 +70,8 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
     if state is not None:
         values["run"]["state_dir"] = STATE_FOLDER
-    if state is not None and state.is_dir():
-        shutil.copytree(state, folder / STATE_FOLDER)
+    if state is not None:
+        copy_state(state, folder / STATE_FOLDER)
     if scenario:
         text = load_scenario(scenario).model_dump_json()
         (folder / SCENARIO_FILE).write_text(text, encoding="utf-8")
@@ -80,6 +82,15 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
         "profile": values,
     }
     (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
+
+
+def copy_state(source: Path, target: Path) -> None:
+    """Copy the files of a state folder that a device reads, if there are any; others are nobody's business, or a trap."""
+    for name in (STATE_FILE, CANOPEN_FILE):
+        with contextlib.suppress(FileNotFoundError):
+            content = read_user_file(source / name)
+            target.mkdir(exist_ok=True)
+            (target / name).write_bytes(content)
 
 
 def _table_of(values: dict[str, Any], keys: Sequence[str]) -> tuple[dict[str, Any], str]:

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Final, TypeVar
 
 from starhil.emulator.control.scenario import Scenario
 from starhil.emulator.device.device import Background, outcome
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.launch.machine import other_machine
-from starhil.emulator.launch.recording import read_recorded, read_run, validated
+from starhil.emulator.launch.recording import copy_state, read_recorded, read_run, validated
 from starhil.emulator.launch.replay_differences import difference_of_truth, difference_sent, units_sent
 from starhil.emulator.links.traffic import Decoder, WireItem
 from starhil.emulator.profile import Profile
@@ -61,7 +60,11 @@ from starhil.protocol.files.user_file import open_user_file
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
+from starhil.protocol.unit import check_runs_no_code
 from starid.errors import StaridError
+
+MAX_LINE: Final = 4_000_000
+"""Longest line of a tape, bytes: some times a request on the control channel, or what waits for a link."""
 
 Item = TypeVar("Item", bytes, CanFrame)
 
@@ -198,10 +201,14 @@ def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
     path = folder / EVENTS_FILE
     last_ns = 0
     with explained(f"replay {path}: cannot be read"), open_user_file(path) as file:
-        for number, line in enumerate(file, start=1):
+        for number, line in enumerate(iter(lambda: file.readline(MAX_LINE), b""), start=1):
+            where = f"{path}: line {number}"
+            if len(line) == MAX_LINE:
+                raise EmulatorError(
+                    f"replay {where}: longer than {MAX_LINE / 1e6:g} MB; the recording is damaged"
+                )
             if not line.endswith(b"\n"):
                 return  # the run was killed while it wrote
-            where = f"{path}: line {number}"
             entry = validated(Line, line, where).root
             if entry.ns < last_ns:
                 why = f"time {entry.ns} ns is before that of the entry above, {last_ns} ns; the recording is damaged"
@@ -210,22 +217,26 @@ def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
             yield where, entry
 
 
-async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
+async def replay(folder: Path, profile: Profile | None = None, unit: str | None = None) -> ReplayReport:
     """Play a recording on the stepped clock, and compare sent items and measurements with it.
 
-    The device may have another profile than the recorded one; `run` except the algorithm, and `links`, are as
-    recorded.
+    The device may have another profile than the recorded one, or another unit; `run` except the algorithm, and `links`,
+    are as recorded. A recorded unit with a Python file of its own is rejected, because others may have made the recording.
     """
     recording_of = read_run(folder)
     recorded = recording_of.profile
+    if unit is not None:
+        recorded = recorded.model_copy(update={"unit": unit})
+    elif profile is None:
+        check_runs_no_code(recorded.unit_source, f"replay {folder}: the recording")
     player = Player(ends_at_once=recorded.run.clock == "stepped")
     report = ReplayReport()
     with tempfile.TemporaryDirectory(prefix="starhil-replay-") as scratch:
         state = ""
         if recorded.run.state_dir:
             state = str(Path(scratch) / STATE_FOLDER)
-            if (folder / STATE_FOLDER).is_dir():
-                shutil.copytree(folder / STATE_FOLDER, state)
+            with explained(f"replay {folder / STATE_FOLDER}: cannot be read"):
+                copy_state(folder / STATE_FOLDER, Path(state))
         truth_log = Path(scratch) / TRUTH_FILE
         links = recorded.links.model_copy(
             update={"serial": recorded.links.serial.model_copy(update={"symlink": ""})}

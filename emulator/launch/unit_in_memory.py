@@ -43,7 +43,7 @@ DESCRIPTOR_LIMIT: Final = 4
 MEMORY_LIMIT_BYTES: Final = 64 * 2**20
 """A life may queue so many events, and add so many descriptors and bytes to those in use after its first power-on."""
 STATE_FOLDER: Final = "state"
-LONGEST_START_S: Final = 120.0
+LONGEST_START_S: Final = 600.0
 """Longest wall time for which a killed pipeline may take to be missed, or to be ready again, seconds."""
 TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
 

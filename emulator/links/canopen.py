@@ -16,6 +16,7 @@ from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.snapshot import Snapshot
+from starhil.emulator.device.state_store import CANOPEN_FILE
 from starhil.emulator.device.telemetry_faults import Hits, TelemetryFault
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import Link
@@ -32,6 +33,7 @@ from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, ParameterStorage, StorageError
+from starhil.protocol.canopen.store_restore import Ended, write_at_once
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.conventions import NANOSECONDS
@@ -42,7 +44,6 @@ from starhil.protocol.transports.base import Transport
 log = logging.getLogger("starhil.canopen")
 
 MILLISECOND_NS: Final = NANOSECONDS // 1000
-STORAGE_FILE: Final = "canopen.json"
 DEVICE_ERROR: Final = 0xFF00
 """Base of the EMCY error codes for the error mode; the number in `device_error` is added."""
 FRAME_QUANTITIES: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
@@ -215,6 +216,7 @@ class CanopenLink(Link[CanFrame]):
             on_save=self.application.save,
             on_restore=self.application.restore,
             on_reset=self._reset_device,
+            background=self._write_in_background,
         )
         self._dictionary = dictionary
         self._actions: deque[Action] = deque()
@@ -365,6 +367,21 @@ class CanopenLink(Link[CanFrame]):
     def _finish_write(self, deferred: Deferred, refusal: SdoAbortError | None) -> None:
         self._run_action(partial(self.slave.finish_write, deferred, refusal=refusal))
 
+    def _write_in_background(self, work: Callable[[], None], ended: Ended) -> None:
+        """Write a file in the thread of the device's state, while the bus is served."""
+        errors: list[StorageError] = []
+
+        def write() -> None:
+            write_at_once(work, lambda error: None if error is None else errors.append(error))
+
+        def written(error: EmulatorError | None) -> None:
+            if error is not None:
+                errors.append(StorageError(str(error)))
+            ended(errors[0] if errors else None)
+            self._run_action(self.slave.tick)
+
+        self._device.write(write, written)
+
     def _notify_rows(self, rows: Sequence[str]) -> None:
         keys = frozenset(key for row in rows for key in self._dictionary.sources.get(row, ()))
         self._run_action(partial(self.slave.notify, keys))
@@ -389,10 +406,7 @@ class CanopenLink(Link[CanFrame]):
     def _parameters_changed(self, names: frozenset[str]) -> None:
         # a node ID that the OBC sets replaces one that was stored by LSS
         if "canopen_node" in names and self._wanted_node != self.slave.node_id:
-            try:
-                self.slave.store.clear_lss()
-            except StorageError as error:
-                self._device.stored.fail(str(error))
+            self.slave.store.clear_lss()
         placed = self._dictionary.parameters
         keys = frozenset(placed[name] for name in names if name in placed)
         self._run_action(partial(self.slave.notify, keys))
@@ -409,5 +423,5 @@ def open_canopen(
     requests: Requests, transport: Transport[CanFrame], state_dir: Path | None, seed: int
 ) -> CanopenLink:
     """Return a link that stores its parameters in `state_dir`, or in memory if this is None."""
-    storage = ParameterStorage() if state_dir is None else FileStorage(state_dir / STORAGE_FILE)
+    storage = ParameterStorage() if state_dir is None else FileStorage(state_dir / CANOPEN_FILE)
     return CanopenLink(requests, transport, storage, seed)

@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 
+from starhil.emulator.device.surroundings import orbit_of
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.table import check_links
 from starhil.emulator.profile import Profile
@@ -33,6 +34,7 @@ from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from starhil.emulator.simulation.clock import make_clock
 from starhil.emulator.simulation.guard import close_all
+from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth.truth import Truth, TruthHost
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.conventions import NANOSECONDS
@@ -96,6 +98,7 @@ class Run:
         automatic = "auto"
         while self._plans:
             profile, icd, imager = self._plans[0]
+            await in_thread(orbit_of, profile)  # of a file, which may be long; then the head has it at once
             head = Head(len(self.heads) + 1, profile, icd, imager, self.truth, self.wiring, self._start_time)
             self.heads.append(head)
             self._plans.pop(0)

@@ -41,17 +41,17 @@ class SensorModel:
     """Exposure, seconds."""
     aperture_m: float = limited(1e-4, 1.0, 0.012, unit="metres")
     """Diameter of the entrance pupil, metres."""
-    transmission: float = limited(1e-3, 1.0, 0.75, unit="a share")
-    quantum_efficiency: float = limited(1e-3, 1.0, 0.45, unit="a share")
+    transmission: float = limited(1e-3, 1.0, 0.75, unit="fraction")
+    quantum_efficiency: float = limited(1e-3, 1.0, 0.45, unit="fraction")
     """Fractions of photons that pass the lens and that free an electron, averaged over the band."""
     zero_point_photons_s_m2: float = limited(1e6, 1e13, 4.6e10, unit="photons/s/m²")
     """Photons/s/m² in the band from a star of V = 0 and solar colour."""
-    colour_term: float = limited(-2.0, 2.0, 0.0, unit="magnitudes a magnitude of B−V")
+    colour_term: float = limited(-2.0, 2.0, 0.0, unit="mag per mag of B−V")
     """The sensor's magnitude is V − colour_term·(B−V − 0.65); about 0.4 for silicon, which favours red stars."""
     psf_sigma_px: float = limited(0.3, 12.0, 0.8, unit="pixels")
     """Standard deviation of the Gaussian spot at the image centre, pixels. 0.8 is about the smallest spot that can be
     fitted without pixel-phase error."""
-    psf_growth: float = limited(0.0, 5.0, 0.0, unit="a share")
+    psf_growth: float = limited(0.0, 5.0, 0.0, unit="fraction")
     """Relative increase of the spot width from the image centre to the edge: along x with the square of x, along y
     with the square of y."""
     gain: float = limited(0.01, 1000.0, 1.0, unit="times")
@@ -60,7 +60,7 @@ class SensorModel:
     """8, 12 or 16."""
     adc_range_e: float = limited(1.0, 1e7, 6400.0, unit="electrons")
     """Full range of the converter at gain 1, electrons."""
-    offset_share: float = limited(0.0, 0.5, 0.03, unit="a share of the converter's range")
+    offset_share: float = limited(0.0, 0.5, 0.03, unit="of the converter's range")
     """Black level as a fraction of the range."""
     full_well_e: float = limited(10.0, 1e7, 15000.0, unit="electrons")
     """Full-well capacity, electrons."""
@@ -81,7 +81,7 @@ class SensorModel:
     boresight_drift_y: float = limited(-1000.0, 1000.0, 0.0, unit="arcseconds/°C")
     boresight_drift_z: float = limited(-1000.0, 1000.0, 0.0, unit="arcseconds/°C")
     """Rotation of the optics relative to the mounting about the axes of the sensor frame, arcseconds/°C."""
-    focal_drift: float = limited(-1e-3, 1e-3, 0.0, unit="a share/°C")
+    focal_drift: float = limited(-1e-3, 1e-3, 0.0, unit="1/°C")
     """Relative change of the focal length, 1/°C."""
     k1_drift: float = limited(-1e-2, 1e-2, 0.0, unit="1/°C")
     """Change of the distortion k1, 1/°C."""
@@ -94,8 +94,8 @@ class SensorModel:
     makes hot pixels, and pixels whose dark current switches between two values."""
     sky_mag_arcsec2: float = limited(-10.0, 40.0, 22.1, unit="magnitudes/arcsec²")
     """Brightness of the sky background (zodiacal light and unresolved stars), V magnitudes/arcsec²."""
-    dsnu: float = limited(0.0, 2.0, 0.2, unit="a share of the dark current")
-    prnu: float = limited(0.0, 0.3, 0.01, unit="a share")
+    dsnu: float = limited(0.0, 2.0, 0.2, unit="of the dark current")
+    prnu: float = limited(0.0, 0.3, 0.01, unit="fraction")
     """Standard deviation between pixels of the dark current and of the sensitivity, relative to their means."""
     hot_pixels: int = limited(0, 10_000_000, 30, unit="pixels")
     """Number of pixels with excessive dark current."""

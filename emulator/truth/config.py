@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self, TypeAlias, get_args
 
 import numpy as np
-from pydantic import BaseModel, Field, model_validator
+from pydantic import BaseModel, Field, PrivateAttr, model_validator
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.simulation.config_model import Date, Strict, UserPath
 from starhil.emulator.truth.feed import Socket
 from starhil.emulator.truth.feed_message import JsonFormat
-from starhil.emulator.truth.file import read_orbit_file, read_truth_file
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.orbit import LARGEST_ECCENTRICITY, KeplerOrbit, Orbit, OrbitState, TleOrbit
 from starhil.emulator.truth.plausibility import doubt_of_orbit
+from starhil.emulator.truth.reading_process import read_orbit, read_truth
 from starhil.emulator.truth.simulator_42 import Format42
 from starhil.emulator.truth.source import (
     MAX_RATE_DEG_S,
@@ -288,7 +288,7 @@ class FileConfig(SourceConfig):
     def build(self, now_s: float, folder: Path) -> TruthSource:
         """Read the file."""
         start_s = now_s if self.start == "now" else 0.0
-        return replace(read_truth_file(folder / self.path), start_s=start_s, repeat=self.repeat)
+        return replace(read_truth(folder / self.path), start_s=start_s, repeat=self.repeat)
 
 
 class LiveConfig(SocketConfig):
@@ -465,10 +465,13 @@ class OrbitFileConfig(Strict):
     """Selects this form of the orbit."""
     path: Annotated[UserPath, InProfileFolder(recorded_as="orbit_source")]
     """The file, see truth-files.md."""
+    _read: Orbit | None = PrivateAttr(None)
 
     def build(self, start_unix_s: float, folder: Path) -> Orbit:  # noqa: ARG002 (one signature for all)
-        """Read the file."""
-        return read_orbit_file(folder / self.path)
+        """Read the file, the first time: whoever must not wait for that calls it before."""
+        if self._read is None:
+            self._read = read_orbit(folder / self.path)
+        return self._read
 
 
 OrbitConfig: TypeAlias = Annotated[

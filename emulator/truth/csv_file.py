@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import csv
 import math
+from collections import Counter
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +32,7 @@ from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.plausibility import doubt_of_orbit
 from starhil.emulator.truth.source import MAX_RATE_DEG_S
 from starhil.emulator.truth.table import FileTruth
+from starhil.protocol.files.user_file import read_user_text
 from starid.attitude import Attitude, rate_between
 from starid.storage.files import read_number
 
@@ -40,6 +42,10 @@ RATE_COLUMNS: Final = ("wx_deg_s", "wy_deg_s", "wz_deg_s")
 POSITION_COLUMNS: Final = ("x_m", "y_m", "z_m")
 VELOCITY_COLUMNS: Final = ("vx_m_s", "vy_m_s", "vz_m_s")
 ORBIT_COLUMNS: Final = (*POSITION_COLUMNS, *VELOCITY_COLUMNS)
+
+MAX_LOG_BYTES: Final = 500_000_000
+LATEST_S: Final = 2e11
+"""Largest number of seconds in a truth log: 6000 years."""
 
 LOG_COLUMNS: Final = {
     "run_time_s": "t",
@@ -116,18 +122,40 @@ def read_log(path: Path, *, measured: bool) -> FileTruth:
     prefix = "measured_" if measured else "true_"
     needed = [prefix + name for name in QUATERNION_COLUMNS]
     try:
-        rows = list(csv.DictReader(path.read_text(encoding="utf-8-sig").splitlines()))
+        rows = list(csv.DictReader(read_user_text(path, MAX_LOG_BYTES).splitlines()))
         valid = [row for row in rows if row[needed[0]]]
-        start_unix_s = round(float(rows[0]["time_of_exposure_s"]) - float(rows[0]["run_time_s"]), 6)
-        times = np.array([float(row["run_time_s"]) for row in valid])
-        attitudes = [Attitude(np.array([float(row[name]) for name in needed])) for row in valid]
-        rates = None if measured else [[float(row[f"true_{name}"]) for name in RATE_COLUMNS] for row in valid]
-    except (OSError, UnicodeDecodeError, csv.Error, KeyError, ValueError, TypeError, IndexError):
+        first_s, run_s = (_in_bounds(rows[0][name]) for name in ("time_of_exposure_s", "run_time_s"))
+        start_unix_s = round(first_s - run_s, 6)
+        times = np.array([_in_bounds(row["run_time_s"]) for row in valid])
+        attitudes = [Attitude(np.array([read_number(row[name]) for name in needed])) for row in valid]
+        rates = (
+            None
+            if measured
+            else [[read_number(row[f"true_{name}"]) for name in RATE_COLUMNS] for row in valid]
+        )
+    except (
+        OSError,
+        UnicodeDecodeError,
+        csv.Error,
+        KeyError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        IndexError,
+    ):
         raise EmulatorError(
             f"{path}: not a truth log with rows; of other files without dates, give --date"
         ) from None
     radians = None if rates is None else np.radians(rates)
     return FileTruth(times, attitudes, radians, start_unix_s=start_unix_s)
+
+
+def _in_bounds(cell: str) -> float:
+    """Return a time or date, seconds; ValueError for one that no clock has."""
+    seconds = read_number(cell)
+    if abs(seconds) > LATEST_S:
+        raise ValueError(f"{cell}: no date")
+    return seconds
 
 
 def _cells(where: str, line: str) -> list[str]:
@@ -143,9 +171,9 @@ def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
     if unknown:
         number = columns.index(unknown[0]) + 1
         raise EmulatorError(f"{where}: column {number} is unknown; known: {', '.join(sorted(readable))}")
-    twice = [name for name in columns if name and columns.count(name) > 1]
-    if twice:
-        raise EmulatorError(f"{where}: column {twice[0]} appears twice; remove one")
+    twice = next((name for name, count in Counter(columns).items() if name and count > 1), None)
+    if twice is not None:
+        raise EmulatorError(f"{where}: column {twice} appears twice; remove one")
     for group in (RATE_COLUMNS, ORBIT_COLUMNS):
         missing = [name for name in group if name not in columns]
         if 0 < len(missing) < len(group):

@@ -14,9 +14,10 @@ from __future__ import annotations
 import math
 import threading
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -220,10 +221,21 @@ def write_kernels(truth: FileTruth, path: Path, structure: int) -> None:
             f"{path}: SPICE cannot read a file of this name; give one of at most {MAX_NAME} ASCII characters"
         )
     files = {suffix: path.with_suffix(suffix) for suffix in (".tls", ".tsc", ".bc")}
+    names = ",\n".join("'" + file.name.replace("'", "''") + "'" for file in files.values())
+    # beside the old ones until they are whole: these may be what is converted, and the disk may be full
+    with TemporaryDirectory(prefix=".starhil-", dir=path.parent) as folder:
+        parts = {suffix: Path(folder, f"part{suffix}") for suffix in files}
+        _write_parts(spice, truth, parts, structure, path)
+        parts[path.suffix] = Path(folder, "part.tm")
+        parts[path.suffix].write_text(META.format(names), encoding="ascii")
+        for suffix, file in (files | {path.suffix: path}).items():
+            parts[suffix].replace(file)
+
+
+def _write_parts(spice: Any, truth: FileTruth, files: Mapping[str, Path], structure: int, path: Path) -> None:
+    """Write all kernels but the meta-kernel."""
     has_rates = truth.rates_rad_s is not None
     with _kernels(spice, path):
-        for file in files.values():
-            file.unlink(missing_ok=True)  # SPICE does not overwrite
         files[".tls"].write_text(_leap_seconds(), encoding="ascii")
         spice.furnsh(str(files[".tls"]))
         zero_s = truth.spans[0].begin_s
@@ -244,8 +256,6 @@ def write_kernels(truth: FileTruth, path: Path, structure: int) -> None:
                 len(ticks), ticks, [spice.m2q(matrix) for matrix in matrices], rates, 1, ticks[:1],
             )  # fmt: skip
         spice.ckcls(handle)
-        names = ",\n".join("'" + file.name.replace("'", "''") + "'" for file in files.values())
-        path.write_text(META.format(names), encoding="ascii")
 
 
 def _leap_seconds() -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import overload
 
 import numpy as np
 
@@ -46,6 +47,52 @@ def span_at(spans: Sequence[Span], t: float) -> Span | None:
     """Return the last of the spans that have begun, each no earlier than the end of the one before; None before the first."""
     number = bisect.bisect_right(spans, t, key=lambda span: span.begin_s) - 1
     return None if number < 0 else spans[number]
+
+
+class Attitudes(Sequence[Attitude]):
+    """The attitudes of quaternions (n, 4), each made when it is needed."""
+
+    def __init__(self, quaternions_xyzw: Array) -> None:
+        self._quaternions = quaternions_xyzw
+
+    @staticmethod
+    def array_of(attitudes: Sequence[Attitude]) -> Array:
+        """Return the quaternions (n, 4) of attitudes."""
+        return np.array([attitude.quaternion_xyzw for attitude in attitudes])
+
+    def __len__(self) -> int:
+        return len(self._quaternions)
+
+    @overload
+    def __getitem__(self, row: int) -> Attitude: ...
+    @overload
+    def __getitem__(self, row: slice) -> Attitudes: ...
+    def __getitem__(self, row: int | slice) -> Attitude | Attitudes:
+        chosen = self._quaternions[row]
+        return Attitudes(chosen) if isinstance(row, slice) else Attitude(chosen)
+
+
+class Orbits(Sequence[OrbitState]):
+    """The states of positions and velocities (n, 6), each made when it is needed."""
+
+    def __init__(self, states: Array) -> None:
+        self._states = states
+
+    @staticmethod
+    def array_of(states: Sequence[OrbitState]) -> Array:
+        """Return positions and velocities (n, 6) of states."""
+        return np.array([(*state.position_m, *state.velocity_m_s) for state in states])
+
+    def __len__(self) -> int:
+        return len(self._states)
+
+    @overload
+    def __getitem__(self, row: int) -> OrbitState: ...
+    @overload
+    def __getitem__(self, row: slice) -> Orbits: ...
+    def __getitem__(self, row: int | slice) -> OrbitState | Orbits:
+        chosen = self._states[row]
+        return Orbits(chosen) if isinstance(row, slice) else OrbitState(chosen[:3], chosen[3:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,22 +192,22 @@ class OrbitTable:
         self, source: object, times_unix_s: Array, states: Sequence[OrbitState], spans: Sequence[Span]
     ) -> None:
         self._source = source
-        self._times = times_unix_s
-        self._states = states
-        self._spans = spans
+        self.times_unix_s = times_unix_s
+        self.states = states
+        self.spans = spans
 
     def state(self, unix_s: float) -> OrbitState:
         """Return position and velocity at a Unix time; EmulatorError if it is in no span."""
-        span = span_at(self._spans, unix_s)
+        span = span_at(self.spans, unix_s)
         if span is None or unix_s > span.end_s:
             raise EmulatorError(
                 f"orbit file {self._source}: its dates do not include the date of the run, Unix time {unix_s:.0f}"
             )
         if span.first == span.last:
-            return self._states[span.first]
-        low, fraction, length_s = _between(self._times[span.rows], unix_s)
+            return self.states[span.first]
+        low, fraction, length_s = _between(self.times_unix_s[span.rows], unix_s)
         low += span.first
-        return interpolate_orbit(self._states[low], self._states[low + 1], fraction, length_s)
+        return interpolate_orbit(self.states[low], self.states[low + 1], fraction, length_s)
 
 
 def _between(times: Array, t: float) -> tuple[int, float, float]:

@@ -290,8 +290,14 @@ class CanopenProbe(Probe):
         self.send(SDO_REQUEST + self.node, data.ljust(SDO_SIZE, b"\0"))
 
     def abandon_transfer(self) -> None:
-        """Abort the last transfer, so that it does not continue into the next case."""
+        """Abort the last transfer, so that it does not continue into the next case.
+
+        Segments of a block may still be under way, so the device type is read, too: what comes after its answer is of the next case.
+        """
         self.send_request(b"\x80" + self._multiplexer + bytes.fromhex("00000008"))
+        self.send_request(upload_request(0x1000, 0))
+        answers = {b"\x43\x00\x10\x00", b"\x80\x00\x10\x00"}
+        self.wait_for(SDO_RESPONSE + self.node, accept=lambda data: data[:4] in answers)
         self.drain()
 
     def expect_unreadable(self, index: int, subindex: int, *codes: int) -> None:

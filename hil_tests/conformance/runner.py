@@ -69,7 +69,7 @@ def select_cases(
 ) -> list[Case[Any]]:
     """Return the cases whose ID matches a pattern with `*` and `?`, or begins with a plain name.
 
-    Raises BenchError: a pattern matches no case.
+    Raises BenchError: a pattern matches no case, or nothing is left.
     """
     selection = list(cases)
     if patterns:
@@ -78,7 +78,13 @@ def select_cases(
                 areas = ", ".join(sorted({item.area for item in selection}))
                 raise BenchError(f"no conformance case matches '{pattern}'; areas: {areas}")
         selection = [item for item in selection if any(_matches(item.id, pattern) for pattern in patterns)]
-    return [item for item in selection if not (safe_only and item.intrusive)]
+    if safe_only:
+        intrusive, selection = len(selection), [item for item in selection if not item.intrusive]
+        if not selection:
+            raise BenchError(
+                f"no conformance case is left: --safe-only leaves out all {intrusive}, which change the device"
+            )
+    return selection
 
 
 def _matches(case_id: str, pattern: str) -> bool:

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
 from starhil.hil_tests.judge.framings import Measure, Taken
 from starhil.hil_tests.judge.messages import PUBLISHED, Request, Value
 from starhil.hil_tests.judge.rows import PARAMETER, SIZES, Field, Row, single
-from starhil.protocol.files.bundled import find_unit
+from starhil.protocol.files.bundled import UNITS_FOLDER, find_unit
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.serial.framings import Receiving
 from starhil.protocol.unit import load_unit
@@ -179,9 +179,21 @@ class Unit:
 
 
 def read_unit(name_or_folder: str | Path) -> Unit:
-    """Return the definition of a unit: a bundled unit by name, a folder of TOML files, or one file."""
+    """Return the definition of a unit: a bundled unit by name, a folder of TOML files, or one file.
+
+    Bundled units are cached.
+    """
     path = find_unit(name_or_folder)
-    return unit_of(load_unit(name_or_folder), path if path.is_dir() else None)
+    return _read_bundled(path) if path.parent == UNITS_FOLDER else _read(path)
+
+
+@cache
+def _read_bundled(path: Path) -> Unit:
+    return _read(path)
+
+
+def _read(path: Path) -> Unit:
+    return unit_of(load_unit(path), path if path.is_dir() else None)
 
 
 def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:

@@ -24,7 +24,8 @@ from starhil.protocol.files.bundled import DEFAULT_UNIT
 
 READY_WITHIN_S: Final = 300.0
 """The first start on a machine compiles for minutes; later ones take about 3 s."""
-STOP_WITHIN_S: Final = 15.0
+STOP_WITHIN_S: Final = 60.0
+"""It takes a moment, and much longer on a machine that is busy with everything else."""
 PROGRESS: Final = "starting:"
 """Begin of the lines on stderr that report the progress of a slow start; they are shown."""
 BAD_INPUT: Final = 2
@@ -168,13 +169,13 @@ class EmulatorProcess:
         except OSError as error:
             raise EmulatorProcessError(f"{self.command[0]}: cannot be started: {error.strerror}") from None
         self._process, self._ended = process, False
-        self._readers = [
-            threading.Thread(target=self._read_output, args=(process.stdout,), daemon=True),
-            threading.Thread(target=self._read_errors, args=(process.stderr,), daemon=True),
-        ]
-        for reader in self._readers:
-            reader.start()
         try:
+            self._readers = [
+                threading.Thread(target=self._read_output, args=(process.stdout,), daemon=True),
+                threading.Thread(target=self._read_errors, args=(process.stderr,), daemon=True),
+            ]
+            for reader in self._readers:
+                reader.start()
             self.ready = self._wait_for_ready()
         except (
             BaseException

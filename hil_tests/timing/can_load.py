@@ -27,6 +27,7 @@ from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.messages import Reply, Request
 from starhil.protocol.transports.can import open_can
+from starid.storage.child_processes import importing_only_what_is_installed
 
 HOST: Final = DEFAULT_HOST_ADDRESS
 DEVICE: Final = DEFAULT_DEVICE_ADDRESS
@@ -100,7 +101,8 @@ class OtherTraffic:
         self._process = mp.get_context("spawn").Process(
             target=_send_traffic, args=(spec, rate, far), kwargs={"realtime": realtime}, daemon=True
         )
-        self._process.start()
+        with importing_only_what_is_installed():
+            self._process.start()
         far.close()
         self._receive_report()
 

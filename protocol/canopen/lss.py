@@ -210,10 +210,9 @@ class LssSlave:
             delay_s = int.from_bytes(data[1:3], "little") * 1e-3
             self._silence = (self._context.now + delay_s, self._context.now + 2 * delay_s)
         elif command == Command.STORE:
-            result = OK
-            try:
-                self._store.save_lss(self.pending_node_id, self.pending_bit_rate)
-            except StorageError as error:
-                self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
-                result = STORAGE_FAILED
-            self._send(command, bytes([result]))
+            self._store.save_lss(self.pending_node_id, self.pending_bit_rate, self._stored)
+
+    def _stored(self, error: StorageError | None) -> None:
+        """Answer the command to store, unless the node has left the configuration state meanwhile."""
+        if self.configuring:
+            self._send(Command.STORE, bytes([OK if error is None else STORAGE_FAILED]))

@@ -22,7 +22,7 @@ from starhil.protocol.canopen.lss import BIT_RATES, LssSlave
 from starhil.protocol.canopen.pdo import PdoService
 from starhil.protocol.canopen.sdo import SdoServer
 from starhil.protocol.canopen.storage import ParameterStorage
-from starhil.protocol.canopen.store_restore import ApplicationStore, StoreRestore
+from starhil.protocol.canopen.store_restore import ApplicationStore, Background, StoreRestore, write_at_once
 from starhil.protocol.canopen.sync import SyncService
 from starhil.protocol.canopen.timestamp import TimeConsumer
 from starhil.protocol.errors import ProtocolError
@@ -56,6 +56,8 @@ class CanopenSlave:
         Bit rates that LSS may set, bit/s.
     on_save, on_restore
         As in `StoreRestore`.
+    background
+        Performs the writes to `storage`; after the end of one that ends later, `tick` returns its answer.
     on_reset
         Called to reset the application when NMT resets the node; a returned node ID applies unless LSS has
         stored one.
@@ -74,19 +76,25 @@ class CanopenSlave:
         on_save: ApplicationStore | None = None,
         on_restore: ApplicationStore | None = None,
         on_reset: Callable[[], int | None] | None = None,
+        background: Background = write_at_once,
     ) -> None:
         if not 1 <= node_id <= 127 and node_id != UNCONFIGURED_NODE:
             raise ProtocolError(f"CANopen node ID {node_id}: must be 1 to 127, or 255 to wait for LSS")
         self.dictionary = dictionary
         self._context = context = Context(dictionary, node_id)
+        self.sdo = SdoServer(context, sdo_timeout_s)
         self.store = StoreRestore(
-            context, ParameterStorage() if storage is None else storage, on_save, on_restore
+            context,
+            ParameterStorage() if storage is None else storage,
+            self.sdo.finish,
+            on_save,
+            on_restore,
+            background,
         )
         self._default_node_id = node_id
         self.lss = LssSlave(context, self.store, self._activate_node_id, bit_rates)
         context.node_id = self.lss.pending_node_id
         self.emergency = EmergencyProducer(context)
-        self.sdo = SdoServer(context, sdo_timeout_s)
         self.pdos = PdoService(context, self.emergency)
         self.sync = SyncService(context, self.emergency, self.pdos.synchronise)
         self.time = TimeConsumer(context)
@@ -153,7 +161,7 @@ class CanopenSlave:
     ) -> list[CanFrame]:
         """Report the result of a deferred write: success, or a refusal."""
         self._begin_instant(now)
-        self.sdo.finish(deferred, refusal)
+        self.sdo.finish(deferred, refusal or self.store.refusal_of(deferred))
         return self._collect_frames()
 
     def raise_emergency(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Final, TypeAlias
 
@@ -24,25 +25,62 @@ ON_COMMAND: Final = b"\x01\0\0\0"
 ApplicationStore: TypeAlias = Callable[[], Deferred | None]
 """Stores the parameters of the application; a `Deferred` is answered when this is done."""
 
+Ended: TypeAlias = Callable[[StorageError | None], None]
+"""Is told how a write has ended."""
+
+Background: TypeAlias = Callable[[Callable[[], None], Ended], None]
+"""Performs a write, and then calls a function with its error or None, at once or later; in the order of the writes."""
+
+
+def write_at_once(work: Callable[[], None], ended: Ended) -> None:
+    """Perform a write, and wait for it."""
+    try:
+        work()
+    except StorageError as error:
+        ended(error)
+    else:
+        ended(None)
+
+
+@dataclass(eq=False)
+class _Write:
+    """A write of communication parameters that an SDO has caused."""
+
+    ended: bool = False
+    refusal: SdoAbortError | None = None
+    answers: Deferred | None = None
+    """What its end answers; None if something that follows it does."""
+
 
 class StoreRestore:
     """Saves the parameters of the communication profile across a restart, and restores the defaults.
 
     Those of the application are its own: `on_save` saves them and raises `SdoAbortError` on failure; `on_restore` resets
-    them to their defaults at its next restart.
+    them to their defaults at its next restart. It performs its writes after those of `background` that precede it.
+
+    `finish` answers an SDO whose write has ended later. Until it has ended, the group has its new values, and no other
+    SDO or LSS command may write it.
     """
 
     def __init__(
         self,
         context: Context,
         storage: ParameterStorage,
+        finish: Callable[[Deferred, SdoAbortError | None], None],
         on_save: ApplicationStore | None = None,
         on_restore: ApplicationStore | None = None,
+        background: Background = write_at_once,
     ) -> None:
         self._context = context
         self._storage = storage
+        self._finish = finish
         self._on_save = on_save
         self._on_restore = on_restore
+        self._background = background
+        self._writing: dict[str, Mapping[str, bytes]] = {}
+        """Values of the groups that are being written."""
+        self._followed: dict[Deferred, _Write] = {}
+        """Writes that a deferred write of the application follows."""
         for index, action in ((STORE, self._store), (RESTORE, self._restore)):
             for subindex in (ALL, COMMUNICATION_ONLY, APPLICATION_ONLY):
                 entry = context.dictionary.find(index, subindex)
@@ -66,15 +104,44 @@ class StoreRestore:
             return None
         return int.from_bytes(values["node_id"], "little"), int.from_bytes(values["bit_rate"], "little")
 
-    def save_lss(self, node_id: int, bit_rate: int) -> None:
-        """Save node ID and bit rate, bit/s. Raises `StorageError` if that fails."""
-        self._storage.save(LSS, {"node_id": bytes([node_id]), "bit_rate": bit_rate.to_bytes(4, "little")})
+    def save_lss(self, node_id: int, bit_rate: int, ended: Ended) -> None:
+        """Save node ID and bit rate, bit/s."""
+        if LSS in self._writing:
+            ended(StorageError("the last values are still being written"))
+            return
+        self._write(LSS, {"node_id": bytes([node_id]), "bit_rate": bit_rate.to_bytes(4, "little")}, ended)
 
     def clear_lss(self) -> None:
-        """Delete what LSS stored. Raises `StorageError` if that fails."""
-        self._storage.clear(LSS)
+        """Delete what LSS stored; an error is reported as an event."""
+        self._write(LSS, {}, lambda _error: None)
 
-    def _stored(self, group: str) -> dict[str, bytes]:
+    def refusal_of(self, deferred: Deferred) -> SdoAbortError | None:
+        """Return why the write that preceded a deferred write of the application has failed; None if it has not."""
+        write = self._followed.pop(deferred, None)
+        return None if write is None else write.refusal
+
+    def _write(self, group: str, values: Mapping[str, bytes], ended: Ended) -> None:
+        """Write the values of a group, or delete a group without values."""
+
+        def work() -> None:
+            if values:
+                self._storage.save(group, values)
+            else:
+                self._storage.clear(group)
+
+        def written(error: StorageError | None) -> None:
+            if self._writing.get(group) is values:
+                del self._writing[group]
+            if error is not None:
+                self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
+            ended(error)
+
+        self._writing[group] = values
+        self._background(work, written)
+
+    def _stored(self, group: str) -> Mapping[str, bytes]:
+        if group in self._writing:
+            return self._writing[group]
         try:
             return self._storage.load(group)
         except StorageError as error:
@@ -84,39 +151,51 @@ class StoreRestore:
     def _store(self, subindex: int, data: bytes) -> Deferred | None:
         if data != SAVE:
             raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'save'")
-        deferred = self._apply(subindex, self._save, self._on_save)
+        deferred = self._apply(subindex, self._changed(), self._on_save)
         self._context.report(EventKind.STORED, subindex)
         return deferred
 
     def _restore(self, subindex: int, data: bytes) -> Deferred | None:
         if data != LOAD:
             raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'load'")
-        deferred = self._apply(subindex, partial(self._storage.clear, COMMUNICATION), self._on_restore)
+        deferred = self._apply(subindex, {}, self._on_restore)
         self._context.report(EventKind.RESTORED, subindex)
         return deferred
 
     def _apply(
-        self, subindex: int, action: Callable[[], None], application: ApplicationStore | None
+        self, subindex: int, values: Mapping[str, bytes], application: ApplicationStore | None
     ) -> Deferred | None:
-        """Save or clear the parameters of a sub-index, those of the application last."""
-        if subindex in {ALL, COMMUNICATION_ONLY}:
-            try:
-                action()
-            except StorageError as error:
-                self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
-                raise SdoAbortError(AbortCode.HARDWARE, str(error)) from None
-        if subindex in {ALL, APPLICATION_ONLY} and application is not None:
-            return application()
-        return None
+        """Write the parameters of a sub-index, those of the application last."""
+        follows = application if subindex in {ALL, APPLICATION_ONLY} else None
+        if subindex == APPLICATION_ONLY:
+            return None if follows is None else follows()
+        if COMMUNICATION in self._writing:
+            raise SdoAbortError(AbortCode.DEVICE_STATE, "the last values are still being written")
+        write = _Write()
 
-    def _save(self) -> None:
-        """Save the values that differ from their defaults, which may depend on the node ID."""
-        values = {
+        def ended(error: StorageError | None) -> None:
+            write.ended = True
+            write.refusal = None if error is None else SdoAbortError(AbortCode.HARDWARE, str(error))
+            if write.answers is not None:
+                self._finish(write.answers, write.refusal)
+
+        self._write(COMMUNICATION, values, ended)
+        if write.refusal is not None:
+            raise write.refusal
+        deferred = None if follows is None else follows()
+        if not write.ended and deferred is not None:
+            self._followed[deferred] = write
+        elif not write.ended:
+            deferred = write.answers = Deferred()
+        return deferred
+
+    def _changed(self) -> dict[str, bytes]:
+        """Return the values that differ from their defaults, which may depend on the node ID."""
+        return {
             f"{entry.key[0]:04X}:{entry.key[1]:02X}": entry.value
             for entry in self._context.dictionary
             if _is_stored(entry) and entry.value != default_bytes(entry.variable, self._context.node_id)
         }
-        self._storage.save(COMMUNICATION, values)
 
 
 def _is_stored(entry: Entry) -> bool:

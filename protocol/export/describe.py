@@ -113,7 +113,7 @@ def field_cells(row: Row) -> Iterator[tuple[str, ...]]:
             _value(field),
             _range(row, field),
             field.provenance if field.name else "",
-            about if field.name else "Unused, sent as 0.",
+            about if field.name else "Sent as 0.",
             value_text(sample[field.name]) if field.name else "",
         )
 

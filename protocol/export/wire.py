@@ -206,7 +206,7 @@ def _cubespace(icd: InterfaceDefinition, framing: CubeSpaceFraming) -> Section:
         "cubespace",
         ((name, *cells) for name, cells in texts["replies"].items() if framing.dialect in (None, name)),
         **texts["one_dialect" if framing.dialect else "all_dialects"],
-        silence=f"On this line, {silent} is neither acknowledged nor refused." if silent else "",
+        silence=f"No reply follows {silent}, whether accepted or rejected." if silent else "",
     )
 
 

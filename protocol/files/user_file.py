@@ -22,6 +22,13 @@ _TOO_LONG: Final = re.compile(r"[0-9][0-9_]{4300}")
 """A decimal number with more digits than Python converts."""
 
 
+_PART: Final = r"""(?:[\w-]+|"(?:[^"\\\n]|\\.)*"|'[^'\n]*')"""
+_DEEP_KEY: Final = re.compile(
+    rf"(?:^|[\[{{,])[ \t]*{_PART}(?:[ \t]*\.[ \t]*{_PART}){{{MAX_DEPTH}}}", re.MULTILINE
+)
+"""A key of more parts than tables may be deep, for which Python's reader takes time that grows with the square of their number."""
+
+
 class TomlError(ValueError):
     """Text is not TOML, or has a value that nothing can use; the text is the reason."""
 
@@ -91,6 +98,8 @@ def parse_toml(text: str) -> dict[str, Any]:
     Raises TomlError also for what Python would accept, but no path, message or field can hold: a whole number of more
     than 64 bits, the character NUL, and tables deeper than `MAX_DEPTH`.
     """
+    if deep := _DEEP_KEY.search(text):
+        raise TomlError(f"nested too deeply{_line_of(text, deep)}")
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -99,11 +108,14 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise TomlError("nested too deeply") from None
     except ValueError:
         found = _TOO_LONG.search(text)
-        line = "" if found is None else f" (at line {text.count(chr(10), 0, found.start()) + 1})"
-        raise TomlError(TOO_WIDE + line) from None
+        raise TomlError(TOO_WIDE + ("" if found is None else _line_of(text, found))) from None
     if wrong := _unusable(document, MAX_DEPTH):
         raise TomlError(wrong.removeprefix("."))
     return document
+
+
+def _line_of(text: str, found: re.Match[str]) -> str:
+    return f" (at line {text.count(chr(10), 0, found.end()) + 1})"
 
 
 def _unusable(value: object, depth: int) -> str:

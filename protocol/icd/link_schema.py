@@ -68,7 +68,7 @@ class CubeSpaceFraming(DefinitionModel):
     dialect: Literal["a", "b", "c"] | None = None
     """Dialect of the unit; default: selected by the parameter `serial_dialect`."""
     unanswered: list[str] = []
-    """Telecommands that are neither acknowledged nor refused on the serial line."""
+    """Telecommands to which the serial line has no reply, whether accepted or rejected."""
 
 
 class EscapedFraming(DefinitionModel):

@@ -166,10 +166,9 @@ class RowKeys(DefinitionModel):
     unsolicited: (
         Annotated[float, Field(gt=0, le=100)] | Annotated[list[Event], Field(min_length=1)] | None
     ) = None
-    """Sends a telemetry row without a request, from the start on: at a rate in Hz, or after each of the listed
-    events. `start`: the unit has started; `frame`: there is a new measurement; `mode`: the mode has changed; `error`:
-    the unit has entered the error mode, or its error has changed; `validity`: the attitude has become valid or
-    invalid."""
+    """Sends a telemetry row without a request: at a rate in Hz, or after listed events. `start`: of the unit; `frame`: a new
+    measurement; `mode`: another mode; `error`: the error mode, or another error in it; `validity`: the attitude has become
+    valid or invalid."""
 
 
 class RowModel(RowKeys):

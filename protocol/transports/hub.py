@@ -3,8 +3,8 @@
 Each client opens a bus by name and receives every frame that other clients send on this bus; frames of one
 sender stay in order. Up to `BACKLOG_LIMIT` bytes wait for a client that reads slowly or not at all. Senders
 take turns in that queue. When it is full, frames of the sender with the most waiting bytes are dropped for
-that client and counted, so a flood delays and loses only its own frames. A malformed command is answered by
-an error and has no effect.
+that client and counted, so a flood delays and loses only its own frames. A malformed command has no effect; the first
+one in what is read at once is answered by an error.
 """
 
 from __future__ import annotations
@@ -123,6 +123,8 @@ class _Client(TurnProtocol):
         self._waiting = FairQueue(BACKLOG_LIMIT)
         self._full = False
         self._settle: asyncio.TimerHandle | None = None
+        self._error_answered = False
+        """Whether a malformed command in what was read last has been answered."""
         self.bus: str | None = None
         self.raw = False
         self.remote = False
@@ -152,6 +154,7 @@ class _Client(TurnProtocol):
 
     def data_received(self, data: bytes) -> None:
         self._end_settling()
+        self._error_answered = False
         frames: list[CanFrame] = []
         for command in self._splitter.feed(data):
             if self.bus is not None and command is not None and command.startswith(b"send "):
@@ -173,6 +176,8 @@ class _Client(TurnProtocol):
 
     def deliver(self, sender: _Client, lines: list[bytes]) -> int:
         """Send frames of another client as soon as there is room; return how many were dropped."""
+        if self._transport.is_closing():
+            return len(lines)
         if self._waiting.size or self._full or self._settle is not None:
             return self._waiting.put(sender, lines)
         self._transport.write(b"".join(lines))
@@ -184,16 +189,19 @@ class _Client(TurnProtocol):
         return self._waiting.size + self._transport.get_write_buffer_size()
 
     def _write_waiting(self) -> None:
-        while self._waiting.size and not self._full:
+        while self._waiting.size and not self._full and not self._transport.is_closing():
             self._transport.write(b"".join(self._waiting.take(WINDOW)))
 
     def _answer(self, text: str) -> None:
-        if self.backlog <= BACKLOG_LIMIT:
+        if self.backlog <= BACKLOG_LIMIT and not self._transport.is_closing():
             self._transport.write(f"< {text} >".encode())
 
     def _answer_error(self, text: str) -> None:
+        """Answer a malformed command, unless another one in the same read has been: answers must not be a multiple of the input."""
         self._hub.statistics.errors += 1
-        self._answer(f"error {text}")
+        if not self._error_answered:
+            self._error_answered = True
+            self._answer(f"error {text}")
 
     def _execute(self, command: bytes | None) -> None:
         match command.split() if command is not None else []:

@@ -9,11 +9,13 @@ import time
 from collections import deque
 from collections.abc import Callable
 from functools import partial
+from types import NoneType
 from typing import Final
 
 import can
 
 from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import TURN_S, ReconnectingTransport, TransportError
 
 QUEUE_LIMIT: Final = 10_000
@@ -109,6 +111,9 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
             try:
                 message = bus.recv(0)
             except (can.CanError, OSError, ValueError) as error:
+                if _is_unreadable(error):
+                    self.statistics.dropped += 1
+                    continue
                 self._lost(str(error))
                 return
             if message is None:
@@ -122,6 +127,8 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
             try:
                 message = bus.recv(READ_TIMEOUT_S)
             except (can.CanError, OSError, ValueError) as error:
+                if _is_unreadable(error):
+                    continue
                 if self._bus is bus:
                     self._from_thread(loop, partial(self._lost, str(error)))
                 return
@@ -143,13 +150,17 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
                     f"CAN {self.description}: bus-off; check the wiring and restart the interface"
                 )
             return
-        frame = CanFrame(
-            message.arbitration_id,
-            b"" if message.is_remote_frame else bytes(message.data),
-            message.is_extended_id,
-            message.is_remote_frame,
-            message.timestamp or None,
-        )
+        try:
+            frame = CanFrame(
+                message.arbitration_id,
+                b"" if message.is_remote_frame else bytes(message.data),
+                message.is_extended_id,
+                message.is_remote_frame,
+                message.timestamp or None,
+            )
+        except ProtocolError:  # no node can send it
+            self.statistics.dropped += 1
+            return
         if self._is_echo(frame):
             return
         self.statistics.received += 1
@@ -252,6 +263,11 @@ def _message(frame: CanFrame) -> can.Message:
         is_extended_id=frame.extended,
         is_remote_frame=frame.remote,
     )
+
+
+def _is_unreadable(error: Exception) -> bool:
+    """Return whether what has been received is no message, on a bus that works: anybody can send to a group of UDP."""
+    return isinstance(error, can.CanOperationError) and not isinstance(error.__cause__, (OSError, NoneType))
 
 
 def _is_full(error: Exception) -> bool:

@@ -59,6 +59,22 @@ def load_unit(name_or_folder: str | Path = DEFAULT_UNIT) -> InterfaceDefinition:
     return _load_bundled(path) if path.parent == UNITS_FOLDER else _load(path)
 
 
+def check_runs_no_code(name_or_folder: str | Path, named_by: str) -> None:
+    """Check that reading a unit, which `named_by` names and not the user, runs no Python file but those of this package.
+
+    Raises IcdError.
+    """
+    path = find_unit(name_or_folder)
+    if path.resolve().parent == UNITS_FOLDER:
+        return
+    file = read_definition(path, run_plugin=False)[0].plugin.skipped
+    if file:
+        raise IcdError(
+            f"{named_by} names the unit {path}, whose Python file {file} would run; if you trust it, name the unit yourself: "
+            f"--unit {path}"
+        )
+
+
 @cache
 def _load_bundled(path: Path) -> InterfaceDefinition:
     return _load(path)

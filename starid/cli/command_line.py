@@ -199,8 +199,6 @@ def run(
         Errors whose text is one line for the user, or that have several such lines as `problems`.
     """
     show_every_character()
-    # processes of a pool would import modules of the working directory first
-    os.environ["PYTHONSAFEPATH"] = "1"
     if os.environ.get("NUMBA_DISABLE_JIT", "0") not in (
         "",
         "0",

@@ -9,6 +9,7 @@ import pytest
 
 from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, identifying_stars
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.case import Case, CaseFailed, check
 from starhil.hil_tests.conformance.runner import identity_of, run_case, run_cases
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
@@ -230,12 +231,13 @@ def test_the_identity_of_a_device_is_read(link, unit, words):
 
 
 class SlowPort:
-    """A port on which everything arrives later."""
+    """A port on which everything arrives later, and not before a time has passed since what came before it."""
 
-    def __init__(self, port, delay_s: float) -> None:
+    def __init__(self, port, delay_s: float, apart_s: float = 0.0) -> None:
         self.send, self.now = port.send, port.now
-        self.port, self.delay_s = port, delay_s
+        self.port, self.delay_s, self.apart_s = port, delay_s, apart_s
         self.coming = []
+        self.last_s = float("-inf")
 
     def receive(self, timeout_s):
         end = self.now() + timeout_s
@@ -245,7 +247,8 @@ class SlowPort:
             until = min(end, self.coming[0][0]) if self.coming else end
             item = self.port.receive(max(0.0, until - self.now()))
             if item is not None:
-                self.coming.append((self.now() + self.delay_s, item))
+                self.last_s = max(self.now() + self.delay_s, self.last_s + self.apart_s)
+                self.coming.append((self.last_s, item))
             elif self.now() >= end:
                 return None
 
@@ -262,6 +265,16 @@ def test_an_answer_after_the_time_out_is_named_as_late(link):
     assert outcome.status == "failed"
     assert outcome.seen.startswith("late: telemetry")
     assert outcome.seen.endswith(" after 0.7 s; see --time-out")
+
+
+def test_segments_still_under_way_from_the_case_before_are_no_answer():
+    """A slow machine delivers the rest of a block after the case that began it has ended."""
+    cases = {case.id: case for case in CANOPEN_CASES}
+    with SimulatedUnit("canopen") as simulated:
+        simulated.probe.port = SlowPort(simulated.probe.port, 0.02, 0.02)
+        for name in ("upload-repeat", "threshold", "upload"):
+            outcome = run_case(simulated.probe, cases[f"canopen.sdo-block.{name}"])
+            assert (outcome.status, outcome.seen) == ("passed", ""), "\n".join(outcome.log)
 
 
 def test_a_late_answer_with_a_sequence_number_is_named_as_late(tmp_path):

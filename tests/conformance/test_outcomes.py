@@ -36,11 +36,17 @@ CASES = [
         ([], True, [0, 1, 3]),
         (["serial.framing"], False, [0, 1]),
         (["*.type", "serial.framing.end"], False, [1, 3]),
-        (["serial.m*"], True, []),
     ],
 )
 def test_cases_are_chosen_by_names_and_patterns(patterns, safe_only, chosen):
     assert select_cases(CASES, patterns, safe_only=safe_only) == [CASES[number] for number in chosen]
+
+
+def test_a_selection_of_which_safe_only_leaves_nothing_is_an_error():
+    with pytest.raises(
+        BenchError, match="no conformance case is left: --safe-only leaves out all 1, which change"
+    ):
+        select_cases(CASES, ["serial.m*"], safe_only=True)
 
 
 def test_a_pattern_without_a_case_is_an_error_that_lists_the_areas():

@@ -88,9 +88,9 @@ def test_every_error_that_changes_a_message_of_the_tutorial_fails_a_case(tmp_pat
     unit = written(tmp_path / "lynx")
     healthy = messages(unit)
     missed, found = [], 0
-    for mutant in MUTANTS:
+    for mutant in (mutant for mutant in MUTANTS if mutant.unit != "tutorial"):  # those have their cases above
         with mutant.planted():
-            if mutant.unit == "tutorial" or messages(unit) != healthy:
+            if messages(unit) != healthy:
                 found += 1
                 if all(outcome.status != "failed" for outcome in outcomes(unit)):
                     missed.append(mutant.name)

@@ -22,6 +22,7 @@ MUTANTS = [
     ("combination.fails", "unit.py", '+ why.encode("ascii")', ""),
     ("combination.matching", "unit.py", "count, 0, 0.0, *mapping, *quaternion", "count, 0, 0.0, *mapping, *quaternion[::-1]"),
     ("combination.time", "unit.py", "snapshot.uptime_ns // 1000 &", "snapshot.uptime_ns // 1000000 &"),
+    ("combination.time-step", "unit.py", "0xFFFFFFFE", "0xFFFFFFFF"),
     ("result.count-zero", "unit.py", 'arguments["count"] or 256', 'arguments["count"]'),
     ("result.forms", "unit.py", 'arguments["count"] | high << 8', "high"),
     ("result.dark-window", "unit.py", "> size", "> size + 65536"),

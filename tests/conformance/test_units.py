@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 import pytest
 
 from starhil.emulator.truth.source import FixedTruth
 from starhil.hil_tests.attitude import conjugate
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, canopen_suite
+from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.conformance_run import POINTING
 from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
@@ -21,8 +25,16 @@ from tests.conformance.test_mutants import MUTANTS
 
 GEN2 = "cubestar-gen2"
 UNITS = ("sagitta", "nos3", "st16", "st200", GEN2)
-SUITES = {"serial": serial_suite, "can": can_suite}
-ON_CAN = {case.id: case for case in can_suite(read_unit(GEN2))}
+SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
+
+
+@cache
+def cases_of(unit: str, link: str) -> dict[str, Case[Any]]:
+    """Return the cases of a unit on a link by ID."""
+    return {case.id: case for case in SUITES[link](read_unit(unit))}
+
+
+ON_CAN = cases_of(GEN2, "can")
 MUTANTS_ON_CAN = [
     *(
         (item.name, item.caught_by, item.damage)
@@ -36,9 +48,8 @@ MUTANTS_ON_CAN = [
 
 @pytest.mark.parametrize(("unit", "link"), [*((unit, "serial") for unit in UNITS), (GEN2, "can")])
 def test_a_bundled_unit_passes_every_case_of_its_definition(unit: str, link: str) -> None:
-    cases = SUITES[link](read_unit(unit))
     with SimulatedUnit(link, unit=unit) as simulated:
-        outcomes = run_cases(simulated.probe, cases)
+        outcomes = run_cases(simulated.probe, cases_of(unit, link).values())
     assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
     assert [o.id for o in outcomes if o.status == "skipped" and ".unjudged." not in o.id] == []
     assert len(outcomes) >= 15
@@ -56,8 +67,7 @@ def test_a_bundled_unit_passes_every_case_of_its_definition(unit: str, link: str
 def test_an_attitude_is_compared_with_the_truth_as_the_unit_reports_it(
     link: str, unit: str, known: str
 ) -> None:
-    suite = {**SUITES, "canopen": canopen_suite}[link](read_unit(unit))
-    cases = [case for case in suite if case.id.startswith(f"{link}.attitude.")]
+    cases = [case for name, case in cases_of(unit, link).items() if name.startswith(f"{link}.attitude.")]
 
     def point(simulated: SimulatedUnit) -> None:
         simulated.device.surroundings.truth = FixedTruth(Attitude.from_quaternion(POINTING))
@@ -70,9 +80,9 @@ def test_an_attitude_is_compared_with_the_truth_as_the_unit_reports_it(
 
 @pytest.mark.parametrize("mutant", list(mutants()), ids=lambda mutant: f"{mutant.unit}: {mutant.name}")
 def test_a_mutant_of_a_unit_is_caught_by_its_case(mutant: UnitMutant) -> None:
-    cases = {case.id: case for case in serial_suite(read_unit(mutant.unit))}
+    case = cases_of(mutant.unit, "serial")[mutant.caught_by]
     with SimulatedUnit("serial", mutant.damage, unit=mutant.unit) as simulated:
-        outcome = run_case(simulated.probe, cases[mutant.caught_by])
+        outcome = run_case(simulated.probe, case)
     assert outcome.status == "failed", f"{mutant.caught_by} passed on a {mutant.unit} where {mutant.name}"
     assert outcome.expected
     assert outcome.seen
@@ -91,7 +101,7 @@ def test_a_mutant_of_a_unit_on_can_is_caught_by_its_case(caught_by: str, damage:
 
 def test_a_unit_on_canopen_passes_every_case_that_its_dictionary_has() -> None:
     with SimulatedUnit("canopen", unit="oresat") as simulated:
-        outcomes = run_cases(simulated.probe, canopen_suite(read_unit("oresat")))
+        outcomes = run_cases(simulated.probe, cases_of("oresat", "canopen").values())
     assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
     assert {o.id: o.seen for o in outcomes if o.status == "skipped" and ".unjudged." not in o.id} == {
         "canopen.design.attitude": "the EDS has no object named sequence"
@@ -100,7 +110,7 @@ def test_a_unit_on_canopen_passes_every_case_that_its_dictionary_has() -> None:
 
 
 def test_the_rows_of_a_unit_with_three_links_pass_on_canopen_too() -> None:
-    cases = [case for case in canopen_suite(read_unit("cubestar")) if case not in CANOPEN_CASES]
+    cases = [case for case in cases_of("cubestar", "canopen").values() if case not in CANOPEN_CASES]
     with SimulatedUnit("canopen") as simulated:
         outcomes = run_cases(simulated.probe, cases)
     assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
@@ -108,9 +118,8 @@ def test_the_rows_of_a_unit_with_three_links_pass_on_canopen_too() -> None:
 
 
 def caught_on_canopen(simulated: SimulatedUnit, case: str) -> None:
-    cases = {item.id: item for item in canopen_suite(read_unit("oresat"))}
     with simulated:
-        outcome = run_case(simulated.probe, cases[f"canopen.{case}"])
+        outcome = run_case(simulated.probe, cases_of("oresat", "canopen")[f"canopen.{case}"])
     assert outcome.status == "failed", f"{case} passed"
     assert outcome.expected
     assert outcome.seen

@@ -10,6 +10,7 @@ from starhil.emulator.sensor.pipeline.client import PipelineReply, PipelineReque
 from starhil.emulator.sensor.pipeline.messages import FrameRequest, IndexRequest, PipelineReady
 from starhil.emulator.simulation.signal import Signal
 from starhil.protocol.messages import ErrorCode, Request
+from tests.waiting import until
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
 
@@ -119,6 +120,4 @@ async def every_row_read(emulation):
         return telemetry(name, snapshot, hits)
 
     emulation.requests.telemetry = note
-    async with asyncio.timeout(20.0):
-        while len(read) < len(emulation.device.icd.telemetry):
-            await asyncio.sleep(0.01)
+    await until(lambda: len(read) >= len(emulation.device.icd.telemetry))

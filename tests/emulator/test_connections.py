@@ -16,8 +16,9 @@ from starhil.emulator.launch import RunOptions
 from starhil.emulator.simulation.guard import log_loop_errors_once
 from starhil.protocol.transports import connections
 from starhil.protocol.transports.hub import CanHub
-from tests.emulator.console.pages import OPTIONS, WITHIN_S
+from tests.emulator.console.pages import OPTIONS
 from tests.emulator.runs import Control
+from tests.waiting import PATIENCE_S, until
 
 DESCRIPTORS = 128
 CONNECTIONS = 130
@@ -25,7 +26,7 @@ CONNECTIONS = 130
 FLOOD = f"""
 import socket, sys
 port, begin = int(sys.argv[1]), sys.argv[2].encode()
-peers = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range({CONNECTIONS})]
+peers = [socket.create_connection(("127.0.0.1", port), timeout={PATIENCE_S}) for _ in range({CONNECTIONS})]
 for peer in peers:
     try:
         peer.sendall(begin)
@@ -60,7 +61,7 @@ async def flooded(port, begin, check):
     """Call `check` while the connections are held."""
     peers = flood(port, begin)
     try:
-        async with asyncio.timeout(WITHIN_S):
+        async with asyncio.timeout(PATIENCE_S):
             assert await asyncio.to_thread(peers.stdout.readline) == b"connected\n"
         await check()
     finally:
@@ -73,14 +74,12 @@ def view_port(emulation):
 
 async def until_full(caplog):
     """Wait until the limit of connections has been reached."""
-    async with asyncio.timeout(WITHIN_S):
-        while "16 connections are open" not in caplog.text:
-            await asyncio.sleep(0.01)
+    await until(lambda: "16 connections are open" in caplog.text)
 
 
 async def answers(control):
     """Whether the control channel answers; a server without a limit runs out of descriptors, and never would."""
-    async with asyncio.timeout(WITHIN_S):
+    async with asyncio.timeout(PATIENCE_S):
         return (await control.do("status"))["ok"]
 
 
@@ -151,7 +150,7 @@ def test_a_peer_that_does_not_read_loses_its_connection(run, monkeypatch, server
                     await loop.sock_sendall(peer, asked)
 
             with pytest.raises(ConnectionError):  # once the server has closed
-                await asyncio.wait_for(ask_without_end(), WITHIN_S)
+                await asyncio.wait_for(ask_without_end(), PATIENCE_S)
 
     run(scenario, options=RunOptions(control="127.0.0.1:0", console=OPTIONS.console))
 
@@ -183,18 +182,14 @@ def test_a_hub_rejects_clients_above_its_limit_and_serves_the_others(few_descrip
         assert await reader.readexactly(6) == b"< hi >"
 
         async def check():
-            async with asyncio.timeout(WITHIN_S):
-                while len(hub.clients) < 16:
-                    await asyncio.sleep(0.01)
+            await until(lambda: len(hub.clients) >= 16)
             writer.write(b"< echo >")
-            assert await asyncio.wait_for(reader.readexactly(8), WITHIN_S) == b"< echo >"
+            assert await asyncio.wait_for(reader.readexactly(8), PATIENCE_S) == b"< echo >"
             assert len(hub.clients) == 16
 
         try:
             await flooded(hub.port, "< open", check)
-            async with asyncio.timeout(WITHIN_S):
-                while len(hub.clients) > 1:
-                    await asyncio.sleep(0.01)
+            await until(lambda: len(hub.clients) <= 1)
         finally:
             writer.close()
             await hub.close()
@@ -217,7 +212,7 @@ def test_a_half_sent_request_is_closed_after_a_time(run, monkeypatch, begin, end
     async def scenario(emulation, _line):
         reader, writer = await asyncio.open_connection("127.0.0.1", view_port(emulation))
         writer.write(begin.format(emulation.ready_fields["view"].partition("?")[2]).encode())
-        answer = await asyncio.wait_for(reader.read(), WITHIN_S)
+        answer = await asyncio.wait_for(reader.read(), PATIENCE_S)
         assert answer.startswith(end)
         assert bool(answer) == bool(end)
         writer.close()
@@ -250,7 +245,7 @@ def test_a_request_that_is_not_http_is_answered_and_not_logged(run, caplog, requ
     async def scenario(emulation, _line):
         reader, writer = await asyncio.open_connection("127.0.0.1", view_port(emulation))
         writer.write(request_)
-        assert (await asyncio.wait_for(reader.read(), WITHIN_S)).startswith(b"HTTP/1.0 400 ")
+        assert (await asyncio.wait_for(reader.read(), PATIENCE_S)).startswith(b"HTTP/1.0 400 ")
         writer.close()
 
     run(scenario, options=OPTIONS)

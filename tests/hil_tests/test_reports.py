@@ -19,6 +19,7 @@ from starhil.hil_tests.reports import write_report
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess
 from starhil.hil_tests.rig.private_can_bus import hub_thread
 from starhil.hil_tests.session import session_run
+from tests.waiting import PATIENCE_S
 
 DIES = "import sys; print('ready can={}', flush=True); print('no more sky', file=sys.stderr); sys.exit(7)"
 
@@ -75,7 +76,7 @@ def test_an_emulator_that_dies_at_the_last_step_fails_the_session_and_its_report
         run = session_run.run_steps
 
         def run_after_its_end(*arguments, **options):
-            process.process.wait(timeout=60)
+            process.process.wait(timeout=PATIENCE_S)
             return run(*arguments, **options)
 
         monkeypatch.setattr(session_run, "run_steps", run_after_its_end)
@@ -137,7 +138,7 @@ def test_a_report_into_the_standard_output_comes_between_the_lines_printed_there
         "print('before'); write_report(Path('/dev/stdout'), b'<report/>'); print('after')"
     )
     with file.open("wb") as stream:
-        subprocess.run([sys.executable, "-c", code], stdout=stream, check=True, timeout=120)
+        subprocess.run([sys.executable, "-c", code], stdout=stream, check=True, timeout=PATIENCE_S)
     assert file.read_text() == "before\n<report/>after\n"
     assert [each.name for each in tmp_path.iterdir()] == ["output"]
 

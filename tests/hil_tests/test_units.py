@@ -14,6 +14,7 @@ from starhil.protocol.messages import Reply, ReplyKind
 from starhil.protocol.serial.stack import SerialStack
 from starhil.protocol.unit import load_unit
 from tests.user_units import STREAM, packets, written
+from tests.waiting import PATIENCE_S
 
 DEFINITION = """
 [unit]
@@ -81,7 +82,7 @@ def ask(tmp_path):
 
     def ask(call, *replies):
         async def whole():
-            client = AsyncObcClient(FakeLink(*replies), icd, timeout_s=5.0)
+            client = AsyncObcClient(FakeLink(*replies), icd, timeout_s=PATIENCE_S)
             return client, await call(client)
 
         return asyncio.run(whole())

@@ -8,6 +8,7 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from starhil.protocol.transports.can import kernel_can_is_up
+from tests.waiting import PATIENCE_S
 
 FAST_BAUD = 921600
 NO_IMAGES = "run.worker=error_model"
@@ -49,13 +50,15 @@ def emulator(running_emulator):
 
     It ends in standby: in another mode it would render images while other modules run.
     """
-    with ObcClient.open(can=running_emulator.ready["can"], timeout_s=5.0) as client:
+    with ObcClient.open(can=running_emulator.ready["can"], timeout_s=PATIENCE_S) as client:
         for command in ("default_parameters", "save_parameters", "reset"):
             client.command(command)
-        client.wait_for("device_status", lambda reading: reading["reset_cause"] == "command", within_s=60.0)
-        client.wait_for("device_status", lambda reading: reading["mode"] == "standby", within_s=60.0)
+        client.wait_for(
+            "device_status", lambda reading: reading["reset_cause"] == "command", within_s=PATIENCE_S
+        )
+        client.wait_for("device_status", lambda reading: reading["mode"] == "standby", within_s=PATIENCE_S)
     yield running_emulator
-    with ObcClient.open(can=running_emulator.ready["can"], timeout_s=5.0) as client:
+    with ObcClient.open(can=running_emulator.ready["can"], timeout_s=PATIENCE_S) as client:
         client.command("set_mode", mode="standby")
 
 
@@ -76,12 +79,12 @@ def sagitta(tmp_path_factory):
 @pytest.fixture
 def serial_obc(emulator):
     """An OBC on the serial line."""
-    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as client:
+    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=PATIENCE_S) as client:
         yield client
 
 
 @pytest.fixture
 def can_obc(emulator):
     """An OBC on the CAN bus."""
-    with ObcClient.open(can=emulator.ready["can"], timeout_s=5.0) as client:
+    with ObcClient.open(can=emulator.ready["can"], timeout_s=PATIENCE_S) as client:
         yield client

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.waiting import PATIENCE_S
+
 pytestmark = pytest.mark.process
 
 ROOT = Path(__file__).parents[2]
@@ -29,7 +31,7 @@ def starhil(*words: str, before: tuple[str, ...] = (), **environment: str) -> tu
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
         check=False,
     )
     return done.returncode, done.stderr
@@ -40,7 +42,7 @@ def bare_dev():
     """Words before a command that give it an empty /dev."""
     words = ("unshare", "--map-root-user", "--mount", "sh", "-e", "-c", BARE_DEV, "sh")
     try:
-        subprocess.run([*words, "true"], check=True, capture_output=True, timeout=20)
+        subprocess.run([*words, "true"], check=True, capture_output=True, timeout=PATIENCE_S)
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("this user may not make a mount namespace (unshare)")
     return words
@@ -84,7 +86,7 @@ def test_a_virtual_environment_that_could_not_be_made_is_made_again(tmp_path):
     python.chmod(0o755)
     make = ["make", "-C", str(tmp_path), "-f", str(ROOT / "Makefile"), f"PYTHON={python}", ".venv/pyvenv.cfg"]
     for _ in range(2):
-        done = subprocess.run(make, capture_output=True, text=True, timeout=20, check=False)
+        done = subprocess.run(make, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         assert (done.returncode, "ensurepip is not available" in done.stdout) == (2, True)
 
 

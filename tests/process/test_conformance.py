@@ -19,6 +19,7 @@ from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_com
 from starhil.protocol.files.bundled import find_unit
 from tests.process.conftest import NO_IMAGES
 from tests.process.test_sessions import starhil
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
@@ -64,7 +65,8 @@ def test_areas_pass_on_pty_bus_and_canopen_and_are_reported(tmp_path):
     chosen += ["canopen.nmt", "canopen.sdo", "canopen.rpdo", "canopen.design"]
     junit, html = tmp_path / "c.xml", tmp_path / "c.html"
     links = ["--serial", "auto", "--can", "auto", "--canopen", "44"]
-    outcomes = conform(*chosen, "--start", *links, *SLOW_MOTION, reports=("--junit", junit, "--html", html))
+    how = ("--start", *links, *SLOW_MOTION, "--set", NO_IMAGES)
+    outcomes = conform(*chosen, *how, reports=("--junit", junit, "--html", html))
     assert len(outcomes) >= 120
     assert int(ET.parse(junit).getroot().get("tests")) == len(outcomes)
     page = html.read_text()
@@ -80,10 +82,10 @@ def test_safe_cases_change_nothing(tmp_path):
     )
     with EmulatorProcess(command) as emulator:
         port = emulator.ready["serial"]
-        with ObcClient.open(serial=port, timeout_s=5.0) as obc:
+        with ObcClient.open(serial=port, timeout_s=PATIENCE_S) as obc:
             before = {name: obc.telemetry(name) for name in rows}
         outcomes = conform(*chosen, "--serial", port, "--safe-only", *SLOW_MOTION)
-        with ObcClient.open(serial=port, timeout_s=5.0) as obc:
+        with ObcClient.open(serial=port, timeout_s=PATIENCE_S) as obc:
             after = {name: obc.telemetry(name) for name in rows}
             last = obc.telemetry("acknowledge")["last_telecommand"]
     assert len(outcomes) > 60

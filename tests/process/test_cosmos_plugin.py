@@ -16,10 +16,10 @@ from starhil.protocol.unit import load_unit
 from tests.protocol.export.cosmos_plugin import Plugin
 from tests.protocol.export.test_export import same
 from tests.protocol.serial.composed_links import CUBESTAR
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
-PATIENCE_S = 60.0
 
 ICD = load_unit()
 CHANGES_THE_DIALECT = frozenset({"reset", "restore_parameters", "default_parameters"})
@@ -86,7 +86,7 @@ def dialect(request: pytest.FixtureRequest, can_obc: ObcClient) -> Iterator[str]
     pytest.importorskip(
         "openc3.packets.packet_config", reason="openc3 drives the emulator; it is not installed (make cosmos)"
     )
-    can_obc.wait_for("device_status", lambda reading: reading["mode"] != "boot", within_s=60.0)
+    can_obc.wait_for("device_status", lambda reading: reading["mode"] != "boot", within_s=PATIENCE_S)
     can_obc.command("set_mode", mode="standby")
     can_obc.set_parameter("serial_dialect", request.param)
     yield request.param

@@ -14,11 +14,11 @@ from starhil.protocol.unit import load_unit
 from tests.candump import read_candump
 from tests.process.test_sessions import starhil
 from tests.protocol.export.dissection import dissect
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
 NODE = 44
-PATIENCE_S = 10.0
 TRIES = 10
 TIMED_OUT = 0x05040000
 BOOT_UP = 0

@@ -18,6 +18,7 @@ from starhil.protocol.unit import load_unit
 from tests.protocol.export.c_driver import COMPILER, FLAGS, CDriver, c_words, hex_or_none
 from tests.protocol.export.test_c import KINDS
 from tests.protocol.serial.composed_links import CUBESTAR
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
@@ -92,16 +93,16 @@ def test_the_component_of_the_docs_reads_the_attitude(emulator, tmp_path: Path) 
         [str(COMPILER), *FLAGS, "-o", program, *sources], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stderr) == (0, "")
-    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
+    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=PATIENCE_S) as obc:
         obc.command("set_mode", mode="standby")  # as after boot
     done = subprocess.run(
-        [program, emulator.ready["serial"]], capture_output=True, text=True, check=False, timeout=60
+        [program, emulator.ready["serial"]], capture_output=True, text=True, check=False, timeout=PATIENCE_S
     )
     assert (done.returncode, done.stderr) == (0, "")
     counts, attitude = done.stdout.splitlines()
     assert counts == "acknowledges 2, refusals 0, faults 0"
-    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
-        truth = obc.wait_for("precise_attitude", lambda reading: bool(reading["valid"]), within_s=60.0)
+    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=PATIENCE_S) as obc:
+        truth = obc.wait_for("precise_attitude", lambda reading: bool(reading["valid"]), within_s=PATIENCE_S)
     seen = [float(word) for word in attitude.removeprefix("valid 1, q ").split()]
     assert seen == pytest.approx([truth[name] for name in ("q_x", "q_y", "q_z", "q_w")], abs=1e-4)
 

@@ -10,7 +10,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import islice
@@ -24,6 +23,7 @@ from scipy.stats import binom, chi2
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, installed_command
 from tests.emulator.cli.command_line import run_command_line
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
@@ -217,14 +217,6 @@ def tumbling(
         unit.slave.terminate()
 
 
-def gone(path: Path, within_s: float = 20.0) -> bool:
-    """Whether a file vanishes in time, here the symbolic link of an emulator that ends."""
-    end = time.monotonic() + within_s
-    while path.is_symlink() and time.monotonic() < end:
-        time.sleep(0.05)
-    return not path.is_symlink()
-
-
 def children(process: int, word: str) -> list[int]:
     """The children of a process that have a word in their command line."""
     pids = Path(f"/proc/{process}/task/{process}/children").read_text().split()
@@ -233,7 +225,7 @@ def children(process: int, word: str) -> list[int]:
 
 def replies(step: Callable[[np.void], object], port: str) -> list[dict[str, object]]:
     """What an OBC reads on the serial line while a simulator steps."""
-    with ObcClient.open(serial=port, timeout_s=5.0) as obc:
+    with ObcClient.open(serial=port, timeout_s=PATIENCE_S) as obc:
         found = []
         for number, row in enumerate(tumble(6.0)):
             step(row)
@@ -251,7 +243,7 @@ def test_an_obc_reads_the_same_as_beside_a_simulator_that_speaks_to_the_feed(
         assert unit.get("ready").startswith("ready truth=tcp:")
         by_fmu = replies(unit.step, str(link))
         unit.slave.terminate()
-        assert gone(link)
+        wait_until(lambda: not link.is_symlink())
     command = emulator_command(
         profile=str(fmu3.parent / QUICK),
         serial="auto",
@@ -356,10 +348,15 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
     )
     root = Path(__file__).parents[2]
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=False, timeout=120
+        [sys.executable, "-c", program],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == -signal.SIGKILL, done.stderr
-    assert gone(link)
+    wait_until(lambda: not link.is_symlink())
 
 
 @pytest.mark.parametrize(
@@ -389,7 +386,7 @@ def test_the_process_rejects_the_values_of_another_version() -> None:
         command = [installed_command(), "fmu", "serve"]
         process = subprocess.Popen(command, stdin=theirs, stderr=subprocess.PIPE, text=True)
         ours.send(b"short")
-        _, said = process.communicate(timeout=60)
+        _, said = process.communicate(timeout=PATIENCE_S)
     assert said == "starhil: fmu serve: the FMU is of another version of starhil; export it again\n"
     assert process.returncode != 0
 
@@ -514,6 +511,6 @@ def test_the_program_of_the_docs_prints_what_they_show(fmu3: Path, tmp_path: Pat
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
     assert done.stdout.splitlines()[-1:] == shown.splitlines(), done.stderr

@@ -19,6 +19,7 @@ from tests.process.reference import (
     is_dangerous,
     requests_in,
 )
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
@@ -26,7 +27,6 @@ STRINGS = 10_000
 FRAMES = 10_000
 BATCH = 40
 """Strings that are sent at once: about 1 KiB, well below what a pty holds."""
-PATIENCE_S = 20.0
 MARK = 0x80
 """Request that ends a batch: identification."""
 

@@ -7,8 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -16,10 +14,10 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
-PATIENCE_S = 240.0
 SESSION = "[[step]]\nread = 'identification'\n[[step]]\nwait_s = 600\n[[step]]\nread = 'device_status'\n"
 
 
@@ -56,13 +54,6 @@ def alive(pid: int) -> bool:
         return False
 
 
-def wait_until(condition, what: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, what
-        time.sleep(0.05)
-
-
 def interrupt(words: list, number: signal.Signals, folder: Path) -> int:
     """Start a command, send it a signal once a line of its run is out.
 
@@ -78,7 +69,7 @@ def interrupt(words: list, number: signal.Signals, folder: Path) -> int:
         process.send_signal(number)
         process.wait(timeout=PATIENCE_S)
         process.stdout.close()
-    wait_until(lambda: not any(alive(pid) for pid in family), f"{family} outlived {number.name}")
+    wait_until(lambda: not any(alive(pid) for pid in family))
     return process.returncode
 
 
@@ -121,21 +112,21 @@ def test_an_emulator_ends_when_its_parent_is_killed_before_the_ready_line(tmp_pa
         "from starhil.hil_tests.rig.emulator_process import emulator_command\n"
         f"child = subprocess.Popen(emulator_command(state_dir={str(tmp_path)!r}), stdout=subprocess.DEVNULL)\n"
         "print(child.pid, flush=True)\n"
-        "time.sleep(600)\n"
+        "time.sleep(1e6)\n"
     )
     with subprocess.Popen([sys.executable, "-c", text], stdout=subprocess.PIPE, text=True) as parent:
         child = int(parent.stdout.readline())
         parent.kill()
-    wait_until(lambda: not alive(child), "the emulator outlived its parent")
+    wait_until(lambda: not alive(child))
 
 
 def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tmp_path):
-    control = tmp_path / "control"
+    control, reading = tmp_path / "control", tmp_path / "reading"
     text = (
         "import sys, time\n"
         "from starhil.emulator.cli.app import main\n"
         "from starhil.emulator.truth import config\n"
-        "config.read_truth_file = lambda *_: time.sleep(600.0)\n"
+        f"config.read_truth_file = lambda *_: (open({str(reading)!r}, 'w').close(), time.sleep(1e6))\n"
         f"sys.argv[1:] = ['run', 'demo', '--serial', 'off', '--can', 'off', '--control', 'unix:{control}']\n"
         "sys.exit(main())\n"
     )
@@ -145,17 +136,12 @@ def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tm
     ):  # ends by SIGTERM
         peer.connect(str(control))
         peer.sendall(b'{"do": "set_truth", "truth": {"kind": "file", "path": "/"}}\n')
-        peer.settimeout(0.5)
-        with pytest.raises(TimeoutError):  # it is being read
-            peer.recv(1)
+        wait_until(reading.exists)
 
 
 def test_an_interrupted_start_ends_the_emulator():
-    process = EmulatorProcess([sys.executable, "-c", "import time; time.sleep(600)"])
-    main = threading.main_thread().ident  # the timer's own thread would not wake the one that waits
-    timer = threading.Timer(1.0, signal.pthread_kill, [main, signal.SIGINT])
-    timer.start()
+    text = "import os, signal, time; os.kill(os.getppid(), signal.SIGINT); time.sleep(600)"
+    process = EmulatorProcess([sys.executable, "-c", text])
     with pytest.raises(KeyboardInterrupt), process:
         pass
-    timer.join()
     assert not process.running

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
@@ -24,7 +25,9 @@ def run_pytest(folder: Path, programs: str | dict[str, str], *options: str) -> s
     for name, program in files.items():
         (folder / name).write_text(program)
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-rs", "-v", *options, *files]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run(
+        command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     return done.stdout + done.stderr
 
 

@@ -8,7 +8,6 @@ import os
 import random
 import re
 import signal
-import time
 import tty
 from concurrent.futures import ThreadPoolExecutor
 
@@ -23,18 +22,11 @@ from starhil.hil_tests.rig.private_can_bus import hub_thread
 from starhil.protocol.can.frame import CanFrame
 from tests.process.conftest import FAST_BAUD, NO_IMAGES
 from tests.process.reference import frame_request
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
 MEMORY_LIMIT = 500e6
-PATIENCE_S = 20.0
-
-
-def wait_until(condition, within_s: float = PATIENCE_S) -> None:
-    deadline = time.monotonic() + within_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not come about in time"
-        time.sleep(0.05)
 
 
 def answers(client: ObcClient, row: str = "identification") -> bool:
@@ -93,7 +85,7 @@ def test_power_cuts_while_parameters_and_canopen_settings_are_being_stored_lose_
         )
         for turn in range(4):
             with (
-                ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc,
+                ObcClient.open(serial=emulator.ready["serial"], timeout_s=PATIENCE_S) as obc,
                 canopen_master(channel) as (network, sdo),
             ):
                 assert obc.get_parameter("exposure") in exposures, f"after cut {turn}"
@@ -129,10 +121,8 @@ def test_a_serial_peer_that_never_reads_does_not_stop_the_device(emulator, can_o
         tty.setraw(port)
         sent = 0
         for _ in range(400):
-            try:
+            with contextlib.suppress(BlockingIOError):
                 sent += os.write(port, frame_request(211))
-            except BlockingIOError:
-                time.sleep(0.01)
             assert can_obc.telemetry("identification")["interface_version"] == 1
         assert sent > 400
     finally:

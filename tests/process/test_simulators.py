@@ -18,6 +18,7 @@ from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_com
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.truth.simulators import blocks_of_42
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
 
@@ -26,7 +27,6 @@ FILES = {
     match[2]: match[1]
     for match in re.finditer(r"^```(?:python|toml)\n(# (\S+)\n.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 }
-WITHIN_S = 300.0
 PNG = b"\x89PNG\r\n\x1a\n"
 
 needs_basilisk = pytest.mark.skipif(
@@ -57,7 +57,7 @@ def printed(program: subprocess.Popen[str]) -> dict[str, list[float]]:
     """Wait for the end of a program; return the numbers that it prints by the text before them."""
     with program:
         try:
-            output, errors = program.communicate(timeout=WITHIN_S)
+            output, errors = program.communicate(timeout=PATIENCE_S)
         except subprocess.TimeoutExpired:
             program.kill()
             raise
@@ -120,7 +120,7 @@ def test_a_basilisk_feed_without_a_listener_is_reported():
 def send_as_42(server: socket.socket, blocks: list[bytes]) -> None:
     """Send the blocks as 42 does, each after the acknowledge of the one before."""
     connection, _ = server.accept()
-    connection.settimeout(WITHIN_S)
+    connection.settimeout(PATIENCE_S)
     with connection:
         for block in blocks:
             connection.sendall(block)
@@ -131,7 +131,7 @@ def send_as_42(server: socket.socket, blocks: list[bytes]) -> None:
 
 def test_42_in_lock_step_and_its_recording(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as server:
-        server.settimeout(WITHIN_S)
+        server.settimeout(PATIENCE_S)
         command = emulator_command(
             profile="ideal",
             settings=["truth.kind=42", f"truth.port={server.getsockname()[1]}", "parameters.start_mode=lost_in_space"],
@@ -143,7 +143,7 @@ def test_42_in_lock_step_and_its_recording(tmp_path):
             simulator = threading.Thread(target=send_as_42, args=(server, blocks_of_42(201)), daemon=True)
             simulator.start()
             figures = printed(start(tmp_path, "obc.py"))
-            simulator.join(WITHIN_S)
+            simulator.join(PATIENCE_S)
             assert not simulator.is_alive()
     assert len((tmp_path / "truth.csv").read_text().splitlines()) == 21
     assert figures["attitudes read"][0] >= 1

@@ -10,6 +10,7 @@ import subprocess
 import threading
 import time
 import tty
+from pathlib import Path
 
 import can
 import pytest
@@ -17,13 +18,11 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from tests.candump import parse_candump, read_candump
-from tests.process.conftest import needs_vcan0
+from tests.process.conftest import NO_IMAGES, needs_vcan0
 from tests.process.test_sessions import starhil
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
-
-PATIENCE_S = 30.0
-READY_WITHIN_S = 180.0
 
 
 @pytest.fixture(scope="module")
@@ -35,18 +34,18 @@ def unit(tmp_path_factory):
         serial="off",
         can="auto",
         seed=1,
-        settings=["truth.attitude.roll_deg=30"],
+        settings=["truth.attitude.roll_deg=30", NO_IMAGES],
         state_dir=state,
         extra=["--canopen", "44"],
     )
-    with EmulatorProcess(command, ready_within_s=READY_WITHIN_S) as process:
+    with EmulatorProcess(command, ready_within_s=PATIENCE_S) as process:
         yield process
 
 
 @pytest.fixture
 def obc(unit):
     """An OBC on vcan0."""
-    with ObcClient.open(can="vcan0", timeout_s=5.0) as client:
+    with ObcClient.open(can="vcan0", timeout_s=PATIENCE_S) as client:
         yield client
 
 
@@ -70,10 +69,8 @@ def dump():
         frames = [parse_candump(line)[1] for line in list(lines)]
         return [str(frame) for frame in frames if frame.extended]
 
-    def _seen(count: int, within_s: float = PATIENCE_S) -> list[str]:
-        deadline = time.monotonic() + within_s
-        while len(_frames()) < count and time.monotonic() < deadline:
-            time.sleep(0.02)
+    def _seen(count: int) -> list[str]:
+        wait_until(lambda: len(_frames()) >= count)
         return _frames()
 
     yield _seen
@@ -190,16 +187,15 @@ def pty_pair():
 
 def test_an_slcan_adapter_on_a_tty(tmp_path):
     with pty_pair() as (kernel_end, device_end):
-        command = emulator_command(serial="off", can=f"slcan:{device_end}", state_dir=tmp_path / "state")
-        with EmulatorProcess(command, ready_within_s=READY_WITHIN_S):
+        command = emulator_command(
+            serial="off", can=f"slcan:{device_end}", state_dir=tmp_path / "state", settings=[NO_IMAGES]
+        )
+        with EmulatorProcess(command, ready_within_s=PATIENCE_S):
             daemon = subprocess.Popen([shutil.which("slcand"), "-F", "-S", "115200", kernel_end, "slcan0"])
             try:
-                deadline = time.monotonic() + 5.0
-                while not os.path.exists("/sys/class/net/slcan0"):  # noqa: PTH110 -- one look
-                    assert time.monotonic() < deadline
-                    time.sleep(0.05)
+                wait_until(Path("/sys/class/net/slcan0").exists)
                 subprocess.run([shutil.which("ip"), "link", "set", "slcan0", "up"], check=True)
-                with ObcClient.open(can="slcan0", timeout_s=5.0) as obc:
+                with ObcClient.open(can="slcan0", timeout_s=PATIENCE_S) as obc:
                     assert obc.telemetry("identification")["interface_version"] == 1
                     assert len(obc.telemetry("precise_attitude")) > 10
             finally:

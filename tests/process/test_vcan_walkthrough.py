@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import os
 import queue
+import shlex
 import subprocess
 import sys
 import threading
@@ -17,12 +18,10 @@ from pathlib import Path
 import pytest
 
 from tests.process.conftest import needs_vcan0
-from tests.test_docs import PAGES, UNASKED, TypedPage, assert_shown, dumped
+from tests.test_docs import NO_IMAGES, PAGES, UNASKED, TypedPage, assert_shown, dumped
+from tests.waiting import PATIENCE_S
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
-
-READY_WITHIN_S = 180.0
-PATIENCE_S = 30.0
 
 
 class Typed:
@@ -78,8 +77,9 @@ def running(line: str, environment: dict[str, str]) -> Iterator[Typed]:
 @contextlib.contextmanager
 def emulator_and_dump(page: TypedPage, environment: dict[str, str]) -> Iterator[Typed]:
     """Type the lines that start the emulator and candump; give the dump."""
-    with running(page.run, environment) as emulator:
-        assert emulator.next_line(READY_WITHIN_S).startswith("ready can=socketcan:vcan0 ")
+    run = f"{page.run} {shlex.join(NO_IMAGES)}"
+    with running(run, environment) as emulator:
+        assert emulator.next_line(PATIENCE_S).startswith("ready can=socketcan:vcan0 ")
         with running(page.candump, environment) as dump:
             with running("cangen vcan0 -g 20 -I 7FE", environment):
                 dump.skip_past("7FE")  # candump listens

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 
 import pytest
 
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, hub_command, installed_command
+from tests.emulator.cli.command_line import run_command_line
 
 pytestmark = pytest.mark.process
 
@@ -35,6 +37,13 @@ def test_a_process_that_the_bench_starts_imports_nothing_from_the_working_direct
     with EmulatorProcess(hub_command()) as hub:
         assert hub.ready["can"]
     assert not was_run.exists()
+
+
+def test_a_command_leaves_the_environment_as_it_is(monkeypatch, tmp_path):
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    monkeypatch.chdir(tmp_path)
+    run_command_line("endurance", "--unit", "nos3", "--lives", "1", "--steps", "1", "--rendered", "0")
+    assert "PYTHONSAFEPATH" not in os.environ
 
 
 def test_the_processes_of_a_pool_import_nothing_from_the_working_directory(was_run):

@@ -14,6 +14,7 @@ import pytest
 from starhil.protocol.unit import load_unit
 from tests.candump import read_candump
 from tests.emulator.cli.command_line import run_command_line
+from tests.waiting import PATIENCE_S
 
 STARHIL = [sys.executable, "-c", "from starhil.emulator.cli.app import main; main()"]
 
@@ -80,7 +81,7 @@ def test_the_hub_as_a_process_serves_two_clients_logs_and_ends_on_sigterm(tmp_pa
         finally:
             process.send_signal(signal.SIGTERM)
         last = process.stdout.read()
-        assert process.wait(10) == 0
+        assert process.wait(PATIENCE_S) == 0
     assert last == "frames=1 delivered=1 dropped=0 errors=0\n"
     assert [(channel, frame.id, frame.data) for channel, frame in read_candump(log)] == [
         ("vcan0", 0x08AA0401, b"\x1f\x02")

@@ -215,6 +215,13 @@ def time(probe: SerialProbe) -> None:
     check(0.9 * passed < (second - first) / 1e6 < 1.1 * passed, f"{passed:.3f} s", (second - first) / 1e6)
 
 
+@COMBINED.case("time-step", "the lowest bit of TIME is 0")
+def time_step(probe: SerialProbe) -> None:
+    for _ in range(16):
+        check_equal(reply(probe, TIME)[0] & 1, 0, "lowest bit")
+        probe.sleep(1e-6)
+
+
 def solved(probe: SerialProbe) -> bytes:
     """Return return code and quaternion of the first result with an attitude."""
     end = probe.now() + SOLVED_S

@@ -317,8 +317,8 @@ def combination(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
 
 @quantity("time.low", unit="us", doc="Lower 32 bits of the count of microseconds since start.")
 def time_low(snapshot: Any) -> int:
-    """Return bits 0 to 31 of TIME."""
-    return int(snapshot.uptime_ns // 1000 & 0xFFFFFFFF)
+    """Return bits 0 to 31 of TIME, whose lowest bit is always 0 (1-35918)."""
+    return int(snapshot.uptime_ns // 1000 & 0xFFFFFFFE)
 
 
 @quantity("time.high", doc="Upper 16 bits of the count of microseconds since start.")

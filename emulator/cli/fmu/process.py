@@ -137,7 +137,7 @@ def _command(values: Values) -> list[str]:
 
 def _unpacked(packet: bytes) -> Values:
     cells = [
-        cell if isinstance(cell, float) else cell.partition(b"\0")[0].decode()
+        cell if isinstance(cell, float) else cell.partition(b"\0")[0].decode(errors="replace")
         for cell in PACKET.unpack(packet)[:-2]
     ]
     return dict(zip([each.name for each in VARIABLES], cells, strict=True))
@@ -145,7 +145,11 @@ def _unpacked(packet: bytes) -> Values:
 
 def _packed(values: Values, message: str, status: int) -> bytes:
     cells = [
-        cell.encode()[: TEXT_SIZE - 1] if isinstance(cell, str) else float(cell)
-        for cell in (*values.values(), message)
+        _shortened(cell) if isinstance(cell, str) else float(cell) for cell in (*values.values(), message)
     ]
     return PACKET.pack(*cells, status)
+
+
+def _shortened(text: str) -> bytes:
+    """Return the whole characters of a text that fit, in UTF-8."""
+    return text.encode(errors="replace")[: TEXT_SIZE - 1].decode(errors="ignore").encode()

@@ -150,7 +150,7 @@ static int begin(struct unit *unit)
     return exchange(unit);
 }
 
-/* A step of the importer's: the inputs hold at its begin. */
+/* A step of the importer's; the inputs are those at its beginning. */
 static int step(struct unit *unit, double time, double size)
 {
     const double end_of_last = unit->values.numbers[TIME];

@@ -11,7 +11,7 @@ import gc
 import subprocess
 import sys
 
-from starhil.emulator.sensor.pipeline.parent_death_signal import end_with_parent
+from starhil.emulator.simulation.parent_death_signal import end_with_parent
 from starid.kernels.kernel_cache import nothing_compiled
 
 

@@ -12,8 +12,8 @@ from contextlib import suppress
 from typing import Any, Final
 
 from starhil.emulator.sensor.pipeline.messages import LENGTH, Failure, with_length
-from starhil.emulator.sensor.pipeline.parent_death_signal import end_with_parent
 from starhil.emulator.simulation.guard import one_line
+from starhil.emulator.simulation.parent_death_signal import end_with_parent
 
 NICE: Final = 5
 """Niceness of the worker, so that the links have priority on a busy machine."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from starid.lab.experiments.comparison import Outcome, ReproduceError
 from starid.lab.experiments.experiment import Context, Evaluation, Experiment, Part, Results
+from starid.storage.child_processes import importing_only_what_is_installed
 from starid.storage.files import write_atomically
 from starid.storage.results import read_results, write_results
 
@@ -172,13 +173,14 @@ def run(
         tasks = [(plan, part) for plan, part in todo if plan.alone == alone]
         work = (delayed(_run_part)(plan, part) for plan, part in tasks)
         parallel = Parallel(n_jobs=1 if alone else jobs, return_as="generator_unordered", batch_size=1)
-        for name, _ in parallel(work):
-            done += 1
-            left[name] -= 1
-            if progress is not None:
-                progress(name, done, len(todo))
-            if left[name] == 0:
-                end(by_name[name])
+        with importing_only_what_is_installed():
+            for name, _ in parallel(work):
+                done += 1
+                left[name] -= 1
+                if progress is not None:
+                    progress(name, done, len(todo))
+                if left[name] == 0:
+                    end(by_name[name])
     return [result for plan in plans if (result := finished[plan.experiment.name]) is not None]
 
 

@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from dataclasses import asdict
 from pathlib import Path
 
@@ -29,6 +28,7 @@ from starhil.emulator.errors import EmulatorError
 from starid.attitude import random_attitude
 from starid.errors import StaridError
 from tests.emulator.cli.command_line import run_command_line
+from tests.waiting import wait_until
 
 PLAN = CampaignPlan(frames=5, seed=11, chunk=2)
 EXACT = [name for name in RECORD.names or () if not name.endswith("_ms")]
@@ -73,9 +73,7 @@ def test_a_killed_campaign_resumes_with_the_same_figures(tmp_path):
     program = "from starhil.emulator.cli.app import main; main()"
     killed = subprocess.Popen([sys.executable, "-c", program, *words, "-o", str(tmp_path / "killed")],
                               stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)  # fmt: skip
-    deadline = time.monotonic() + 200
-    while not list((tmp_path / "killed").glob("chunk-*.npz")) and time.monotonic() < deadline:
-        time.sleep(0.05)
+    wait_until(lambda: list((tmp_path / "killed").glob("chunk-*.npz")))
     os.killpg(killed.pid, signal.SIGKILL)
     killed.wait()
     kept = {file.name: file.stat().st_mtime_ns for file in (tmp_path / "killed").glob("chunk-*.npz")}

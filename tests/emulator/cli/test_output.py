@@ -20,6 +20,7 @@ from starid.cli import command_line
 from starid.cli.output import show_every_character
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.workers import WORKER
+from tests.waiting import PATIENCE_S
 
 PROGRAM = [sys.executable, "-c", "from starhil.emulator.cli import main; main()"]
 WRITTEN = {"--output", "--junit", "--html", "--truth-log"}
@@ -28,7 +29,7 @@ WRITTEN = {"--output", "--junit", "--html", "--truth-log"}
 
 def starhil(*arguments: str, **environment: str) -> subprocess.CompletedProcess[bytes]:
     return subprocess.run(
-        [*PROGRAM, *arguments], capture_output=True, timeout=300, env={**os.environ, **environment}
+        [*PROGRAM, *arguments], capture_output=True, timeout=PATIENCE_S, env={**os.environ, **environment}
     )
 
 

@@ -187,3 +187,14 @@ def test_a_link_that_the_unit_lacks_is_left_out_with_a_warning(monkeypatch, capl
     monkeypatch.setattr("starhil.emulator.run.run.make_pipeline", lambda *_, **__: None)
     Run([Profile.model_validate({"unit": "sagitta", "links": {"can": {"channel": "vcan0"}}})])
     assert "links.can.channel: unit sagitta has no such link" in caplog.text
+
+
+def test_bindings_lists_quantities_actions_with_arguments_and_parameters():
+    lines = unit("bindings").stdout.splitlines()
+    assert 'value = "attitude.valid"  Whether the attitude of the last frame is valid.' in lines
+    action = next(number for number, line in enumerate(lines) if line.startswith('action = "set_hole_map"'))
+    assert [line.split('"')[1] for line in lines[action + 1 : action + 3]] == ["section", "map"]
+    assert any(line.startswith('parameter = "exposure"  ms: ') for line in lines)
+    listed = json.loads(unit("bindings", "--json").stdout)
+    assert len(listed["quantities"]) == sum(line.startswith("value = ") for line in lines)
+    assert {item["name"] for item in listed["actions"]} >= {"set_clock", "set_hole_map"}

@@ -5,18 +5,19 @@ import shutil
 import socket
 import threading
 import time
+from array import array
 from contextlib import contextmanager, suppress
+from fcntl import ioctl
 from pathlib import Path
+from termios import FIONREAD
 
 import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
+from tests.waiting import PATIENCE_S
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-WITHIN_MS = 120_000
-"""What a page and an emulator may take on a machine that runs all tests at once."""
-
 AXE = (
     Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     / "starhil-tests/axe-core-4.14.1/package/axe.min.js"
@@ -55,7 +56,7 @@ def emulator_with_console(*extra, **options):
 def opened(browser, address, width=1280, height=800):
     """Yield a page of the console; whatever the browser's console says is a failure."""
     page = browser.new_page(viewport={"width": width, "height": height})
-    page.set_default_timeout(WITHIN_MS)
+    page.set_default_timeout(1000 * PATIENCE_S)
     said = []
     page.on("console", lambda message: said.append(message.text))
     page.on("pageerror", lambda error: said.append(str(error)))
@@ -90,6 +91,23 @@ def fault(page, **levels):
     assert ask(page, do="control", request={"do": "fault", **levels})["ok"]
 
 
+@contextmanager
+def requests_of(page):
+    """Yield a function that returns what the page has requested since, but what to show and how bytes are encoded."""
+    page.evaluate(
+        "() => { window.requested = []; const { link } = starhil; link.request = (content) => { requested.push(content.do); return link.constructor.prototype.request.call(link, content); }; }"
+    )
+    yield lambda: [do for do in page.evaluate("requested") if do not in ("subscribe", "encode", "parameters")]
+    page.evaluate("() => { delete starhil.link.request; }")
+
+
+def let_pass(page, seconds):
+    """Wait until simulation time has passed, whatever the page shows."""
+    run_time = "async () => (await starhil.link.control({ do: 'status' })).run_time_s"
+    end = page.evaluate(run_time) + seconds
+    page.wait_for_function(f"async (end) => await ({run_time})() >= end", arg=end, polling=100)
+
+
 def track(page):
     """Have the device track."""
     if page.locator("#mode").text_content() != "tracking":
@@ -98,30 +116,55 @@ def track(page):
     wait_for_text(page, "#validity", "valid")
 
 
-@contextmanager
-def slow_link(port, bytes_s, buffered=8192):
-    """Yield the port of a proxy that passes bytes from a server at a rate, and buffers some, as `ssh -L` does."""
+class SlowLink:
+    """A proxy of a server that holds what waits, as `ssh -L` does, and passes it on at a rate.
 
-    def pump(source, sink, pause_s):
+    Attributes
+    ----------
+    bytes_s
+        The rate; without limit at first.
+    most
+        The most bytes from the server that have waited.
+    """
+
+    BUFFER = 2_000_000
+    """Bytes that the way holds."""
+
+    def __init__(self, port):
+        self.bytes_s = float("inf")
+        self.most = 0
+        self._server = port
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+
+    def __enter__(self):
+        threading.Thread(target=self._serve, daemon=True).start()
+        return self
+
+    def __exit__(self, *_exc):
+        self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+
+    def _serve(self):
+        with suppress(OSError):
+            while True:
+                client, _ = self._listener.accept()
+                server = socket.socket()
+                server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, self.BUFFER)
+                server.connect(("127.0.0.1", self._server))
+                for ends in ((client, server), (server, client)):
+                    threading.Thread(target=self._pump, args=ends, daemon=True).start()
+
+    def _pump(self, source, sink):
+        from_server = source.getpeername()[1] == self._server
+        waiting = array("i", [0])
         with suppress(OSError):
             while data := source.recv(2048):
+                if from_server:
+                    ioctl(source, FIONREAD, waiting)
+                    self.most = max(self.most, len(data) + waiting[0])
+                    time.sleep(len(data) / self.bytes_s)
                 sink.sendall(data)
-                time.sleep(len(data) * pause_s)
         for each in (source, sink):
             with suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)
-
-    def serve():
-        with suppress(OSError):
-            while True:
-                client, _ = listener.accept()
-                server = socket.socket()
-                server.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, buffered)
-                server.connect(("127.0.0.1", port))
-                for arguments in ((client, server, 0.0), (server, client, 1.0 / bytes_s)):
-                    threading.Thread(target=pump, args=arguments, daemon=True).start()
-
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        threading.Thread(target=serve, daemon=True).start()
-        yield listener.getsockname()[1]
-        listener.shutdown(socket.SHUT_RDWR)

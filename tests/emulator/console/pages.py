@@ -10,11 +10,9 @@ import numpy as np
 from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.console.history import COLUMNS, TIMES
 from starhil.emulator.launch import ConsoleOptions, RunOptions
+from tests.waiting import PATIENCE_S
 
 OPTIONS = RunOptions(control="auto", console=ConsoleOptions(ConsoleClient, view="auto"))
-
-
-WITHIN_S = 20.0
 
 
 class Page:
@@ -50,7 +48,7 @@ class Page:
 
     async def receive(self):
         """Receive a turn."""
-        data = (await asyncio.wait_for(self.socket.receive(), WITHIN_S)).data
+        data = (await asyncio.wait_for(self.socket.receive(), PATIENCE_S)).data
         self.turns += 1
         (length,) = struct.unpack_from("<I", data)
         turn = json.loads(data[4 : 4 + length])
@@ -83,7 +81,7 @@ class Page:
 
     async def until(self, condition):
         """Receive until a condition holds."""
-        async with asyncio.timeout(WITHIN_S):
+        async with asyncio.timeout(PATIENCE_S):
             while not (found := condition()):
                 await self.receive()
         return found

@@ -12,7 +12,8 @@ from starhil.hil_tests.client.links import CanHostLink, SerialHostLink
 from starhil.hil_tests.session.script import load_script
 from starhil.protocol.unit import load_unit
 from tests.candump import parse_candump
-from tests.emulator.console.pages import OPTIONS, WITHIN_S, Page
+from tests.emulator.console.pages import OPTIONS, Page
+from tests.waiting import PATIENCE_S
 
 LINKS_OFF = {"serial": {"port": "off"}, "can": {"channel": "off"}}
 
@@ -98,7 +99,7 @@ def test_the_requests_of_the_obc_are_counted_and_those_of_the_console_are_not(ru
             assert emulation.device.counters.telemetry == 0
             await as_obc(emulation, emulation.icd, bus)
             status = await page.message("status", lambda item: item["heard"][0]["requests"] == 2)
-            assert 0.0 <= status["heard"][0]["age_s"] < WITHIN_S
+            assert 0.0 <= status["heard"][0]["age_s"] < PATIENCE_S
             assert emulation.device.counters.telemetry == 2
 
     run(scenario, options=OPTIONS, unit=unit, links={**LINKS_OFF, **links})

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import select
 import socket
 import struct
 from contextlib import AsyncExitStack
@@ -20,8 +21,9 @@ from starhil.emulator.errors import EmulatorError
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.rig.console_feed import RunFeed
 from tests.emulator.conftest import PREVIEW
-from tests.emulator.console.pages import ALONG_X, OPTIONS, WITHIN_S, Page, column
+from tests.emulator.console.pages import ALONG_X, OPTIONS, Page, column
 from tests.emulator.runs import command, read
+from tests.waiting import until
 
 
 @pytest.mark.parametrize(
@@ -177,9 +179,7 @@ def test_previews_are_made_only_while_a_page_shows_images(run):
             await emulation.stepper.step(2.0)
             assert all(request.preview for request in run.pipeline.frames[before + 1 :])
             await page.until(lambda: page.frames)
-        async with asyncio.timeout(WITHIN_S):
-            while emulation.imager.watchers:
-                await asyncio.sleep(0.01)
+        await until(lambda: not emulation.imager.watchers)
         seen = len(run.pipeline.frames)
         await emulation.stepper.step(2.0)
         assert len(run.pipeline.frames) > seen
@@ -681,13 +681,17 @@ def test_a_session_reports_its_results_to_the_console_as_they_arrive(run):
 def test_a_result_that_takes_longer_than_an_idle_connection_lives_is_reported(run, monkeypatch):
     monkeypatch.setattr(server, "REQUEST_S", 0.2)
 
+    def idle_and_closed(connection):
+        readable = connection.sock is not None and select.select([connection.sock], [], [], 0.0)[0]
+        return bool(readable) and connection.sock.recv(1, socket.MSG_PEEK) == b""
+
     async def scenario(emulation, _line):
         async with Page(emulation) as page:
             feed = await asyncio.to_thread(
                 RunFeed, emulation.ready_fields["view"], kind="session", title="", unit="", planned=2
             )
             for name in ("first", "second"):
-                await asyncio.sleep(1.0)
+                await until(lambda: idle_and_closed(feed._connection))
                 feed.result(id=name, name=name, status="passed")
                 await page.message("result", lambda item, name=name: item["result"]["name"] == name)
             await asyncio.to_thread(feed.close)

@@ -15,6 +15,7 @@ from starhil.emulator.run.truth_log import COLUMNS
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.file import read_truth_file
 from tests.emulator.runs import Control, command
+from tests.waiting import PATIENCE_S
 
 REQUESTS = 10_000
 
@@ -129,7 +130,7 @@ def test_a_slow_truth_file_holds_up_nothing_else(run, tmp_path, monkeypatch):
     go = threading.Event()
 
     def slowly(*arguments, **options):
-        assert go.wait(60.0)
+        assert go.wait(PATIENCE_S)
         return read_truth_file(*arguments, **options)
 
     monkeypatch.setattr("starhil.emulator.truth.config.read_truth_file", slowly)

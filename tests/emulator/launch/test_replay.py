@@ -9,12 +9,13 @@ import json
 import os
 import platform
 import re
+import shutil
 
 import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions, machine
-from starhil.emulator.launch.recording import prepare_recording, read_run
+from starhil.emulator.launch.recording import copy_state, prepare_recording, read_run
 from starhil.emulator.launch.replay import replay
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.run.recorder import EVENTS_FILE, RUN_FILE, SCENARIO_FILE, TRUTH_FILE
@@ -22,13 +23,14 @@ from starhil.emulator.sensor.pipeline.messages import PipelineEnded, PipelineRea
 from starhil.hil_tests.client import AsyncObcClient
 from starhil.hil_tests.client.links import CanHostLink, SerialHostLink
 from starhil.hil_tests.errors import BenchError
+from starhil.protocol.files.bundled import UNITS_FOLDER
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import CAMERA, Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
+from tests.waiting import PATIENCE_S, until
 
 PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 5.0}
 ROUNDS = 10
-WITHIN_S = 60.0
 
 
 @pytest.fixture
@@ -51,13 +53,13 @@ def report_of(folder):
 async def talk(emulation, frames):
     """Command and read the device over its serial line, as an OBC does, for some frames."""
     client = AsyncObcClient(
-        SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
+        SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=PATIENCE_S
     )
     await client.start()
     await client.set_parameter("exposure", 80)
     await client.command("save_parameters")
     rounds = 0
-    async with asyncio.timeout(WITHIN_S):
+    async with asyncio.timeout(PATIENCE_S):
         while emulation.device.cycle.published < frames or rounds < ROUNDS:
             if emulation.stepper is not None:
                 await emulation.stepper.step(0.05)
@@ -137,13 +139,83 @@ def test_runs_with_other_state_folders_are_recorded_alike(tmp_path):
     assert read_run(folder).profile.run.state_dir == "state"
 
 
+@pytest.fixture
+def unit_of_others(tmp_path):
+    """Return the folder of a unit whose Python file leaves a mark, and the mark."""
+    mark, unit = tmp_path / "mark", tmp_path / "others" / "unit"
+    shutil.copytree(UNITS_FOLDER / "st16", unit)
+    with (unit / "unit.py").open("a") as file:
+        file.write(f"\nopen({str(mark)!r}, 'w').close()\n")
+    return unit, mark
+
+
+def test_nothing_runs_that_only_a_recording_names(tmp_path, unit_of_others, monkeypatch):
+    unit, mark = unit_of_others
+    folder = tmp_path / "recorded"
+    prepare_recording(folder, Profile(unit=str(unit)), "")
+    status, _, err = run_command_line("replay", str(folder))
+    assert (status, mark.exists()) == (2, False)
+    assert err.count("\n") == 1
+    assert (
+        f"whose Python file unit.py would run; if you trust it, name the unit yourself: --unit {unit}" in err
+    )
+    # nor a unit that is inside a recording, wherever that lies
+    content = json.loads((folder / RUN_FILE).read_text())
+    content["folder"], content["profile"]["unit"] = ".", "others/unit"
+    (folder / RUN_FILE).write_text(json.dumps(content))
+    monkeypatch.chdir(tmp_path)
+    assert run_command_line("replay", str(folder))[0] == 2
+    assert not mark.exists()
+    status, _, err = run_command_line("replay", str(folder), "--unit", "others/unit")
+    assert mark.exists()
+    assert f"{folder / EVENTS_FILE}: cannot be read" in err  # there is no tape
+
+
+def test_a_unit_of_toml_alone_is_replayed_from_where_it_was(tmp_path):
+    unit = tmp_path / "unit"
+    shutil.copytree(UNITS_FOLDER / "st200", unit)
+    folder = tmp_path / "recorded"
+    prepare_recording(folder, Profile(unit=str(unit)), "")
+    _, _, err = run_command_line("replay", str(folder))
+    assert f"{folder / EVENTS_FILE}: cannot be read" in err
+
+
+@pytest.mark.parametrize("trap", ["loop", "device", "pipe"])
+def test_of_a_state_folder_only_the_files_of_a_device_are_copied(tmp_path, trap):
+    state = tmp_path / "state"
+    state.mkdir()
+    (state / "device.json").write_text("{}")
+    match trap:
+        case "loop":
+            (state / "loop").symlink_to(".")
+        case "device":
+            (state / "zero").symlink_to("/dev/zero")
+        case _:
+            os.mkfifo(state / "pipe")
+    folder = tmp_path / "recorded"
+    prepare_recording(folder, Profile(run={"state_dir": str(state)}), "")
+    assert [path.name for path in (folder / "state").iterdir()] == ["device.json"]
+    copy_state(state, tmp_path / "copy")
+    assert [path.name for path in (tmp_path / "copy").iterdir()] == ["device.json"]
+
+
+def test_a_state_file_that_cannot_be_read_is_named(tmp_path):
+    folder = tmp_path / "recorded"
+    prepare_recording(folder, Profile(run={"state_dir": str(tmp_path / "none")}), "")
+    (folder / "state").mkdir()
+    os.mkfifo(folder / "state" / "device.json")
+    status, _, err = run_command_line("replay", str(folder))
+    assert (status, err.count("\n")) == (2, 1)
+    assert f"replay {folder / 'state'}: cannot be read (not a regular file)" in err
+
+
 def test_can_frames_and_canopen_are_repeated(record):
     bus = "virtual:recorded"
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=WITHIN_S)
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=PATIENCE_S)
         await client.start()
-        async with asyncio.timeout(WITHIN_S):
+        async with asyncio.timeout(PATIENCE_S):
             while emulation.device.cycle.published < 4:
                 await client.telemetry("precise_attitude")
                 await asyncio.sleep(0.02)
@@ -160,7 +232,7 @@ def test_frames_that_are_sent_with_gaps_and_delays_are_repeated(record):
     """The gap between two frames passes after the request, while other entries arrive."""
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink("virtual:gaps"), emulation.icd, timeout_s=WITHIN_S)
+        client = AsyncObcClient(CanHostLink("virtual:gaps"), emulation.icd, timeout_s=PATIENCE_S)
         await client.start()
         async with Control(emulation) as control:
             for fault in ({"delay_s": 0.02}, {}):
@@ -176,7 +248,9 @@ def test_frames_that_are_sent_with_gaps_and_delays_are_repeated(record):
 def test_a_unit_without_dialects_is_repeated_at_its_own_bit_rate(record):
     async def scenario(emulation, _line):
         client = AsyncObcClient(
-            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]),
+            emulation.icd,
+            timeout_s=PATIENCE_S,
         )
         await client.start()
         for _ in range(5):
@@ -194,9 +268,7 @@ def test_a_unit_without_dialects_is_repeated_at_its_own_bit_rate(record):
 def test_a_simulator_is_not_needed_for_the_replay(record, clock):
     async def scenario(emulation, _line):
         await Stub42(blocks_of_42(31)).connect(int(emulation.ready_fields["truth"].rpartition(":")[2]))
-        async with asyncio.timeout(WITHIN_S):
-            while emulation.device.cycle.published < 3:
-                await asyncio.sleep(0.02)
+        await until(lambda: emulation.device.cycle.published >= 3)
 
     folder = record(scenario, clock=clock, truth={"kind": "42", "role": "server", "port": 0})
     assert report_of(folder).differences == []
@@ -218,11 +290,11 @@ def test_a_run_whose_pipeline_dies_and_is_restarted_is_repeated(record, clock):
         imager._handle = lambda _request: PipelineEnded("killed")
         imager.ended.emit("killed")
         assert device.modes.mode.value == "error"
-        async with asyncio.timeout(WITHIN_S):
-            while not device.warm:
-                await asyncio.sleep(0.05)
+        await until(lambda: device.warm)
         client = AsyncObcClient(
-            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]),
+            emulation.icd,
+            timeout_s=PATIENCE_S,
         )
         await client.start()
         await client.command("set_mode", mode="standby")
@@ -301,7 +373,9 @@ def test_a_changed_byte_of_a_message_that_no_longer_decodes_is_named(record, at,
 
     async def scenario(emulation, _line):
         client = AsyncObcClient(
-            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd, timeout_s=WITHIN_S
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]),
+            emulation.icd,
+            timeout_s=PATIENCE_S,
         )
         await client.start()
         await client.command("go")
@@ -331,7 +405,7 @@ def test_a_changed_address_of_a_can_frame_is_shown_in_both_frames(record):
     bus = "virtual:id"
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=WITHIN_S)
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=PATIENCE_S)
         await client.start()
         for name in ("identification", "device_status", "identification"):
             await client.telemetry(name)
@@ -350,7 +424,7 @@ def test_a_changed_can_frame_is_named_by_its_row_or_its_meaning_in_canopen(recor
     bus = "virtual:changed"
 
     async def scenario(emulation, _line):
-        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=WITHIN_S)
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd, timeout_s=PATIENCE_S)
         await client.start()
         await client.telemetry("device_status")
         await client.close()

@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import tty
 from pathlib import Path
 
@@ -22,12 +21,10 @@ from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
 from tests.emulator.workers import NEVER_READY
 from tests.protocol.serial.composed_links import CUBESTAR
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
-READY_WITHIN_S = 300.0
-"""A first start compiles."""
-REPLY_WITHIN_S = 30.0
 ACCURACY_ARCSEC = 20.0
 ICD = load_unit()
 
@@ -48,12 +45,12 @@ class Emulator:
             [*command, "--can", "off", "--control", "auto", *arguments],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
-        assert select.select([self.process.stdout], [], [], READY_WITHIN_S)[0], "no ready line"
+        assert select.select([self.process.stdout], [], [], PATIENCE_S)[0], "no ready line"
         line = self.process.stdout.readline()
         assert line.startswith("ready "), self.process.stderr.read()
         self.ready = dict(word.split("=", 1) for word in line.split()[1:])
         self.control = socket.socket(socket.AF_UNIX)
-        self.control.settimeout(REPLY_WITHIN_S)
+        self.control.settimeout(PATIENCE_S)
         self.control.connect(self.ready["control"].removeprefix("unix:"))
         self.lines = self.control.makefile("rw")
         self.fd = os.open(self.ready["serial"], os.O_RDWR | os.O_NOCTTY)
@@ -73,7 +70,7 @@ class Emulator:
         os.write(self.fd, host.request(request))
         raw, replies = b"", []
         while not replies:
-            assert select.select([self.fd], [], [], REPLY_WITHIN_S)[0], "no reply"
+            assert select.select([self.fd], [], [], PATIENCE_S)[0], "no reply"
             data = os.read(self.fd, 4096)
             raw += data
             replies = host.feed(data, 0.0)
@@ -91,7 +88,7 @@ class Emulator:
         os.close(self.fd)
         self.control.close()
         self.process.send_signal(number)
-        _, errors = self.process.communicate(timeout=30)
+        _, errors = self.process.communicate(timeout=PATIENCE_S)
         return self.process.returncode, log_lines(errors)
 
 
@@ -277,10 +274,7 @@ def test_the_worker_ends_with_a_killed_emulator_and_the_next_one_takes_its_place
     (worker,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     code, _ = emulator.end(signal.SIGKILL)
     assert code == -signal.SIGKILL
-    until = time.monotonic() + READY_WITHIN_S
-    while is_running(worker):
-        assert time.monotonic() < until, "the worker goes on without its parent"
-        time.sleep(0.02)
+    wait_until(lambda: not is_running(worker))
     assert link.is_symlink()
     emulator = Emulator(*arguments)
     assert emulator.read("boot_status")["boot_count"] == 2

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
+from tests.waiting import PATIENCE_S
 
 AHEAD = """
 import sys
@@ -25,7 +26,7 @@ main()
 
 def python(program):
     command = [sys.executable, "-c", program]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
 
 @pytest.mark.process

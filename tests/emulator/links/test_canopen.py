@@ -278,6 +278,25 @@ def test_save_parameters_is_answered_when_the_disk_is_done(linked, error, answer
     linked(test)
 
 
+@pytest.mark.parametrize("store", ["23 10 10 02 73 61 76 65", "23 11 10 02 6c 6f 61 64"])
+def test_the_bus_does_not_wait_for_the_disk(linked, store):
+    storage = ParameterStorage()
+    storage.save("communication", {"1017:00": b"\x05\x00"})
+
+    def test(link):
+        waiting = []
+        link.device._background = lambda work, done: waiting.append((work, done))
+        assert link.sdo(store) == ""
+        assert link.sdo("40 00 10 00").startswith("43")
+        assert link.sdo(store).startswith("80")
+        ((work, done),) = waiting
+        work()
+        done(None)
+        assert link.sdo("40 00 10 00").startswith("43")
+
+    linked(test, storage)
+
+
 def test_take_is_answered_when_the_frame_can_be_read(linked):
     def test(link):
         assert link.sdo("40 40 60 01") == "8040600124000008"
@@ -386,7 +405,7 @@ def test_storage_in_the_folder_of_the_state(make_bench, tmp_path):
         requests = make_bench().start().requests
         link = open_canopen(requests, PaperTransport(), tmp_path, 1)
         await link.start()
-        link.slave.store.save_lss(60, 500_000)
+        link.slave.store.save_lss(60, 500_000, lambda _error: None)
         await link.close()
 
     asyncio.run(within())

@@ -27,6 +27,7 @@ from starhil.protocol.transports.serial import open_serial
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
 from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
+from tests.waiting import PATIENCE_S, until
 
 SEED = 20260101
 JUNK = 10_000
@@ -259,8 +260,7 @@ def test_a_gap_between_frames_is_kept(bench):
         for frame in encode_request_frames(Request.of(211), 1, 4):
             bus.arrive(frame)
         assert len(bus.sent) == 1
-        while len(bus.sent) < 8:
-            await asyncio.sleep(0.001)
+        await until(lambda: len(bus.sent) >= 8)
         await link.close()
 
     in_loop(scenario())
@@ -278,9 +278,7 @@ def test_the_acknowledge_of_a_reset_is_sent_in_its_turn(bench):
         boots = bench.device.boot_count
         bench.step(0.1)
         assert bench.device.boot_count == boots + 1
-        async with asyncio.timeout(10.0):
-            while len(bus.sent) < 9:  # eight of the telemetry, one of the acknowledge
-                await asyncio.sleep(0.001)
+        await until(lambda: len(bus.sent) >= 9)  # eight of the telemetry, one of the acknowledge
         assert CanId.unpack(bus.sent[-1].id).type == MessageType.TELECOMMAND_ACK
         await link.close()
 
@@ -399,7 +397,7 @@ def test_a_flood_on_the_serial_line_leaves_the_loop_to_others_after_some_80_faul
                     socket.create_connection((address.hostname, address.port))
                 ).fileno()
             written = os.write(peer, b"\x1f\x7f\x80" * 1300)
-            async with asyncio.timeout(10.0):
+            async with asyncio.timeout(PATIENCE_S):
                 while counts[-1] < written // 3 - 1:
                     await asyncio.sleep(0)
                     counts.append(sum(bench.device.counters.faults.values()))

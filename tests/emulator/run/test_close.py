@@ -1,7 +1,8 @@
 """The end of a run, whatever it is doing then: nothing happens after it, and no failure is lost."""
 
 import asyncio
-import time
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -9,7 +10,7 @@ from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.errors import EmulatorError
 from tests.emulator.runs import command
-from tests.protocol.transports.pairs import turns, until
+from tests.waiting import PATIENCE_S, turns, until
 
 LONG_STEP_S = 86_400.0
 REQUEST = bytes.fromhex("1F7FE61FFF")
@@ -20,7 +21,7 @@ def test_a_step_ends_with_the_run(run):
         stepping = asyncio.create_task(emulation.stepper.step(LONG_STEP_S))
         await until(lambda: emulation.device.cycle.published > 0)
         await run.launched.close()
-        await asyncio.wait({stepping}, timeout=1.0)
+        await asyncio.wait({stepping}, timeout=PATIENCE_S)
         assert stepping.cancelled()
         return emulation.device.cycle.published, emulation.clock.now_ns()
 
@@ -84,12 +85,19 @@ def test_a_last_write_that_fails_is_reported(run, tmp_path, monkeypatch, caplog)
     """The failure arrives in the event loop after the thread that writes has ended."""
 
     async def scenario(emulation, _line):
+        closing, shutdown = threading.Event(), ThreadPoolExecutor.shutdown
+
+        def wait_for_the_thread(executor, **options):
+            closing.set()
+            shutdown(executor, **options)
+
         def fail_slowly(_store, _content):
-            time.sleep(0.2)
+            closing.wait()
             raise EmulatorError("no space left")
 
         monkeypatch.setattr(FileStore, "save", fail_slowly)
         command(emulation, "save_parameters")
+        monkeypatch.setattr(ThreadPoolExecutor, "shutdown", wait_for_the_thread)
         await run.launched.close()
         return run.launched.failed
 

@@ -7,8 +7,8 @@ import pytest
 from starhil.emulator.profile import load_profile
 from starhil.emulator.run import Run
 from tests.emulator.runs import FirstHead, command
+from tests.waiting import PATIENCE_S, until
 
-WITHIN_S = 60.0
 FRAMES = 3
 FEWER_STARS = {"limiting_magnitude": 3.0}
 LOST_IN_SPACE = "parameters.start_mode=lost_in_space"
@@ -25,11 +25,11 @@ def run(scenario, state_dir, clock="scaled:2", worker="thread"):
         try:
             await run.open()
             run.begin()
-            await asyncio.wait_for(run.ready(), WITHIN_S)
+            await asyncio.wait_for(run.ready(), PATIENCE_S)
             emulation = FirstHead(run)
             emulation.shots = []
             emulation.device.signals.frame_published.connect(emulation.shots.append)
-            return await asyncio.wait_for(scenario(emulation), WITHIN_S)
+            return await asyncio.wait_for(scenario(emulation), PATIENCE_S)
         finally:
             await run.close()
 
@@ -41,8 +41,7 @@ async def first_frames(emulation):
     emulation.shots.clear()
     if emulation.stepper is not None:
         await emulation.stepper.step(FRAMES + 1.0)
-    while len(emulation.shots) < FRAMES:
-        await asyncio.sleep(0.01)
+    await until(lambda: len(emulation.shots) >= FRAMES)
     return [snapshot.result for snapshot in emulation.shots[:FRAMES]]
 
 
@@ -84,10 +83,8 @@ def test_after_a_reset_it_is_solved_with_the_restored_parameters(tmp_path):
 def test_after_the_end_of_the_pipeline_it_is_solved_with_the_current_parameters(tmp_path):
     async def kill(emulation):
         emulation.imager.worker.process.kill()
-        while emulation.device.modes.mode.value != "error":
-            await asyncio.sleep(0.01)
-        while not emulation.device.warm:
-            await asyncio.sleep(0.01)
+        await until(lambda: emulation.device.modes.mode.value == "error")
+        await until(lambda: emulation.device.warm)
         command(emulation, "set_mode", mode="standby")
         command(emulation, "set_mode", mode="lost_in_space")
         return await first_frames(emulation)

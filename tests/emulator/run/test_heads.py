@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-
 import numpy as np
 import pytest
 
@@ -15,6 +13,7 @@ from starhil.hil_tests.client import AsyncObcClient
 from starhil.hil_tests.client.links import CanHostLink
 from tests.emulator.runs import Control
 from tests.emulator.truth.simulators import RATE_DEG_S, Stub42, blocks_of_42
+from tests.waiting import until
 
 BORESIGHT_ALONG_X = {"matrix": [[0, 0, -1], [0, 1, 0], [1, 0, 0]]}
 PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 2.0}
@@ -95,9 +94,7 @@ def test_the_control_channel_commands_each_head_and_changes_the_truth_of_all(run
 
 def test_heads_on_the_real_clock_expose_by_themselves(run):
     async def scenario(emulation, _line):
-        async with asyncio.timeout(60.0):
-            while any(each.device.cycle.published < 2 for each in emulation.heads):
-                await asyncio.sleep(0.05)
+        await until(lambda: not any(each.device.cycle.published < 2 for each in emulation.heads))
 
     run(scenario, clock="real", others=[head(5)], **head(4))
 

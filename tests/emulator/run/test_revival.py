@@ -8,9 +8,8 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
 from tests.emulator.runs import CAMERA, FirstHead, command, read
 from tests.emulator.workers import ANSWERING, WORKER
-from tests.protocol.transports.pairs import turns
+from tests.waiting import PATIENCE_S, turns, until
 
-WITHIN_S = 20.0
 ENDS_AT_ONCE = ""
 ENDS_WHEN_READY = WORKER + f"send(PipelineReady({CAMERA}, 5, 0.0))\n"
 REJECTS = WORKER + "send(Failure('no catalogue'))\n"
@@ -42,19 +41,14 @@ def run(worker):
             try:
                 await run.open()
                 run.begin()
-                await asyncio.wait_for(run.ready(), WITHIN_S)
-                await asyncio.wait_for(scenario(FirstHead(run), process.started), WITHIN_S)
+                await asyncio.wait_for(run.ready(), PATIENCE_S)
+                await asyncio.wait_for(scenario(FirstHead(run), process.started), PATIENCE_S)
             finally:
                 await run.close()
 
         asyncio.run(whole())
 
     return run
-
-
-async def until(condition):
-    while not condition():
-        await asyncio.sleep(0.01)
 
 
 def set_mode(emulation, mode):

@@ -25,6 +25,7 @@ from starhil.protocol.files.bundled import bundled
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.unit import load_unit
 from tests.emulator.runs import CAMERA, Control, FakeImager, FirstHead, command, read
+from tests.waiting import until
 
 
 def test_a_scenario_reads_its_truth_files_when_the_run_starts(run, tmp_path):
@@ -64,8 +65,7 @@ def test_the_real_clock_advances_by_itself(run):
         device = emulation.device
         assert device.modes.mode.value == "standby"
         command(emulation, "set_mode", mode="lost_in_space")
-        while device.cycle.published < 5:
-            await asyncio.sleep(0.01)
+        await until(lambda: device.cycle.published >= 5)
         assert device.latest.valid
         async with Control(emulation) as control:
             answer = await control.do("step", seconds=1.0)
@@ -447,12 +447,10 @@ def test_a_pipeline_that_dies_is_reported_and_restarted():
             await emulation.stepper.step(2.0)
             assert emulation.device.latest.valid
             emulation.imager.worker.process.kill()
-            while emulation.device.modes.mode.value != "error":
-                await asyncio.sleep(0.01)
+            await until(lambda: emulation.device.modes.mode.value == "error")
             assert emulation.device.modes.error == "processing"
             assert read(emulation, "precise_attitude")["reason"] == "processing_error"
-            while not emulation.device.warm:  # another one comes up by itself
-                await asyncio.sleep(0.05)
+            await until(lambda: emulation.device.warm)  # another one comes up by itself
             command(emulation, "set_mode", mode="standby")
             command(emulation, "set_mode", mode="lost_in_space")
             await emulation.stepper.step(2.0)
@@ -501,8 +499,7 @@ def test_a_save_that_fails_in_an_unforeseen_way_ends_the_acknowledge(run, monkey
         device = emulation.device
         monkeypatch.setattr(device.store, "save", lambda _content: {}["no such key"])
         command(emulation, "save_parameters")
-        while not device.acknowledge.processed:
-            await asyncio.sleep(0.01)
+        await until(lambda: device.acknowledge.processed)
         assert device.acknowledge.error.name == "INTERNAL"
         assert device.parameters.state.differs_from_store is False
 

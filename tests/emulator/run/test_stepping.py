@@ -9,6 +9,7 @@ import pytest
 
 from starhil.protocol.messages import Request
 from tests.protocol.serial.composed_links import CUBESPACE
+from tests.waiting import until
 
 STEP_S = 30.0
 PEER_BYTES_S = 300_000.0
@@ -59,8 +60,7 @@ def long_step(run):
             counting.cancel()
             statistics = emulation.links["serial"].transport.statistics
             assert statistics.dropped == 0
-            while len(peer.data) < statistics.sent:
-                await asyncio.sleep(0.01)
+            await until(lambda: len(peer.data) >= statistics.sent)
             return bytes(peer.data), turns
 
         return run(scenario, **SETTINGS)
@@ -104,8 +104,7 @@ def test_a_peer_that_does_not_read_is_waited_for_once_and_then_again_when_it_rea
         dropped = statistics.dropped
         await emulation.stepper.step(STEP_S)
         assert statistics.dropped == dropped
-        while len(peer.data) < statistics.sent:
-            await asyncio.sleep(0.01)
+        await until(lambda: len(peer.data) >= statistics.sent)
 
     run(scenario, **SETTINGS)
 
@@ -115,8 +114,7 @@ def test_wire_delays_use_simulation_time(run):
         peer = Peer(emulation.ready_fields["serial"])
         emulation.links["serial"].wire.settings = type(emulation.links["serial"].wire.settings)(delay_s=5.0)
         os.write(peer.fd, CUBESPACE.encode_request(Request.of(128)))
-        while emulation.device.counters.telemetry == 0:
-            await asyncio.sleep(0.01)
+        await until(lambda: emulation.device.counters.telemetry != 0)
         await emulation.stepper.step(4.9)
         assert emulation.links["serial"].transport.statistics.sent == 0
         await emulation.stepper.step(0.2)

@@ -21,6 +21,7 @@ from starhil.emulator.truth.truth import seen_from
 from starid.attitude import Attitude, propagate
 from tests.emulator.runs import Control
 from tests.emulator.truth.simulators import ORION
+from tests.waiting import until
 
 MILLIARCSECOND = 1e-3
 RATE_DEG_S = [0.4, 0.1, -0.2]
@@ -214,9 +215,7 @@ def test_a_run_that_ends_within_a_long_step_ends_quietly(run, caplog, through):
             host, port = emulation.ready_fields["truth"].removeprefix("tcp:").rsplit(":", 1)
             _, writer = await asyncio.open_connection(host, int(port))
             writer.write(line(0.0, ORION).encode() + b"\n" + line(80_000.0, ORION).encode() + b"\n")
-        async with asyncio.timeout(20.0):
-            while emulation.clock.now_ns() == 0:
-                await asyncio.sleep(0.0)
+        await until(lambda: emulation.clock.now_ns() != 0)
 
     truth = {"kind": "live", "protocol": "tcp", "lockstep": True}
     run(scenario, truth=truth, options=RunOptions(control="auto"), parameters={"start_mode": "lost_in_space"})

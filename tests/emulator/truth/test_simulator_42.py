@@ -25,10 +25,10 @@ from tests.emulator.truth.simulators import (
     block_of_42,
     blocks_of_42,
 )
+from tests.waiting import PATIENCE_S, until
 
 MILLIARCSECOND = 1e-3
 START_UNIX_S = datetime(2024, 12, 31, 23, tzinfo=UTC).timestamp()
-WITHIN_S = 60.0
 
 
 def apart_arcsec(one, other):
@@ -139,7 +139,7 @@ def lockstep(run, tmp_path, name, blocks, role="client"):
             await emulation.truth.set(type(emulation.profile).model_validate(truth_of(port)).truth)
         else:
             await stub.connect(int(emulation.ready_fields["truth"].rpartition(":")[2]))
-        async with asyncio.timeout(WITHIN_S):
+        async with asyncio.timeout(PATIENCE_S):
             await stub.done.wait()
         assert stub.acknowledged == len(blocks)
         feed = emulation.truth.source
@@ -229,11 +229,10 @@ def test_a_42_that_comes_later_is_connected_to(run, caplog, monkeypatch):
         port = gone.sockets[0].getsockname()[1]
         gone.close()
         await emulation.truth.set(type(emulation.profile).model_validate(truth_of(port)).truth)
-        while "no connection" not in caplog.text:
-            await asyncio.sleep(0.01)
+        await until(lambda: "no connection" in caplog.text)
         stub = Stub42(blocks_of_42(11))
         await asyncio.start_server(stub.send, "127.0.0.1", port)
-        async with asyncio.timeout(WITHIN_S):
+        async with asyncio.timeout(PATIENCE_S):
             await stub.done.wait()
         return emulation.clock.now_ns()
 

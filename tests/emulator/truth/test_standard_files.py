@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import importlib.util
 import io
 import json
@@ -11,11 +12,13 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth import spice_file
 from starhil.emulator.truth.file import read_orbit_file, read_truth_file
 from starhil.emulator.truth.source import SlewSegment, SlewTruth
 from starhil.emulator.truth.standard_frames import euler_turns, unix_ns
@@ -23,6 +26,7 @@ from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
 from starid.catalog.earth import unix_time
 from tests.emulator.cli.command_line import run_command_line
+from tests.waiting import PATIENCE_S
 
 SLEW = SlewTruth(
     Attitude.from_radec_roll(83.8, -1.2, 30.0),
@@ -107,7 +111,7 @@ def orekit(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_orekit(*arguments: object) -> str:
     command = [sys.executable, Path(__file__).with_name("orekit_files.py"), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -249,6 +253,25 @@ def test_a_ck_has_the_attitudes_that_spice_gives(
             )
     finally:
         spice.kclear()
+
+
+def test_kernels_replace_others_only_when_all_are_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    needs("spiceypy")
+    monkeypatch.chdir(tmp_path)
+    source = write(tmp_path, aem())
+    words = ["-o", "out.tm", "--structure", "-44007"]
+    assert run_command_line("truth", "convert", str(source), *words)[0] == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with monkeypatch.context() as full:
+        full.setattr(spice_file, "_leap_seconds", Mock(side_effect=OSError(errno.ENOSPC, "No space left")))
+        status, _, said = run_command_line("truth", "convert", "out.tm", *words)
+    assert (status, "No space left" in said) == (2, True)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert run_command_line("truth", "convert", "out.tm", *words)[0] == 0  # onto what it reads
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in before}
+    assert len(read_truth_file(Path("out.tm")).attitudes) > 100
 
 
 def test_an_spk_gives_the_position(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """What published OBC software does with the files of a CubeComputer, from its bytes: list, erase, capture, download, reset.
 
-Each driver is written from its wire facts, with its own framing, time-outs and assumptions, and shares no code with the product:
+Each driver is written from its wire facts, with its own framing, time-outs and assumptions, and shares no code with the product.
+What AlbertaSat's own code sent and took is also recorded, in `albertasat_files.txt`:
 
 AlbertaSat
     ex2_hal/adcs in AlbertaSat/ex2_obc_software: UART, replies with ID. It waits for no reply to telecommands 1, 101 and 119.
@@ -17,6 +18,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -411,6 +413,38 @@ def test_albertasat_captures_lists_downloads_and_erases_images():
         assert obc.telemetry(234, 1) == b"\0"
         assert obc.file_list() == []
 
+    run(scenario)
+
+
+RECORDED = Path(__file__).with_name("albertasat_files.txt")
+STEP_S = 0.005
+"""Time after each request of the record."""
+
+
+def recorded() -> list[tuple[bool, bytes, bytes]]:
+    """Whether it was repeated until answered like this, request, and answer, of all exchanges of the record."""
+    exchanges: list[tuple[bool, bytes, bytes]] = []
+    for line in RECORDED.read_text(encoding="ascii").splitlines():
+        mark, _, digits = line.partition(" ")
+        if mark in (">", ">>"):
+            exchanges.append((mark == ">>", bytes.fromhex(digits), b""))
+        elif mark == "<":
+            polled, request, answer = exchanges[-1]
+            exchanges[-1] = (polled, request, answer + bytes.fromhex(digits))
+    return exchanges
+
+
+def test_what_albertasat_s_code_sent_is_answered_with_the_bytes_that_it_took():
+    def scenario(unit: Emulated) -> None:
+        for number, (polled, request, wanted) in enumerate(recorded(), 1):
+            for _ in range(100 if polled else 1):
+                answer = unit.ask(request)
+                answer += b"".join(unit.step(STEP_S))
+                if answer == wanted:
+                    break
+            assert answer == wanted, f"exchange {number}"
+
+    assert len(recorded()) == 43
     run(scenario)
 
 

@@ -15,6 +15,7 @@ from starhil.protocol.files.bundled import UNITS_FOLDER
 from starhil.protocol.unit import load_unit
 from tests.emulator.units.clients import Emulated, arcseconds_between, true_matrix, with_unit
 from tests.protocol.canopen.conftest import import_eds
+from tests.waiting import PATIENCE_S
 
 NODE = 0x2C
 STANDBY, STAR_TRACK = 2, 4
@@ -216,7 +217,7 @@ def test_the_bench_commands_and_reads_a_card_with_custom_error_numbers_by_name(r
     (tmp_path / "unit.toml").write_text(f"{definition}\n[errors]\ninvalid_parameter = 99\n", encoding="utf-8")
 
     def drive():
-        with ObcClient.open(can=channel, unit=unit, timeout_s=20.0) as obc:
+        with ObcClient.open(can=channel, unit=unit, timeout_s=PATIENCE_S) as obc:
             obc.command("set_status", status="lost_in_space")
             with pytest.raises(NackError, match="invalid_parameter"):
                 obc.command("set_status", status=77, checked=False)

@@ -22,11 +22,9 @@ from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.unit import load_unit
 from tests.hil_tests.fake_device import EDGE, FakeDevice, bmp_file
+from tests.waiting import PATIENCE_S, wait_until
 
-PATIENCE_S = 5.0
 TIMEOUT_S = 0.15
-PATIENCE_S = 20.0
-"""For requests that the device leaves unanswered."""
 LINKS = ["serial-a", "serial-b", "serial-c", "can"]
 
 
@@ -185,9 +183,7 @@ def test_a_late_reply_does_not_answer_the_next_request(pair):
     device.mute, device.late_s = 1, TIMEOUT_S + 0.02
     with pytest.raises(NoReplyError):
         client.read("rates", timeout_s=TIMEOUT_S)
-    until = time.monotonic() + PATIENCE_S
-    while not (client.stray_replies or client.faults) and time.monotonic() < until:
-        time.sleep(0.01)
+    wait_until(lambda: client.stray_replies or client.faults)
     assert client.telemetry("quaternion")["q_x"] == 0.5
 
 

@@ -17,6 +17,7 @@ from starhil.hil_tests.errors import BenchError, NackError
 from starhil.protocol.can.cubespace import CanHostReceiver, encode_reply_frames
 from starhil.protocol.image_transfer import burst_packet, file_checksum, frame_checksum, packet_count
 from starhil.protocol.messages import BURST_ID, ErrorCode, Reply, ReplyKind
+from tests.waiting import PATIENCE_S
 
 PIXELS = np.arange(64 * 64, dtype=np.uint8).reshape(64, 64)
 FILE = cv2.imencode(".bmp", PIXELS)[1].tobytes()
@@ -84,13 +85,13 @@ def _no_waiting(monkeypatch):
 
 def test_a_frame_with_a_wrong_checksum_is_read_again():
     device = Device({"damage": {"rows": ["image_frame"]}}, busy=2)
-    image = asyncio.run(download_by_frames(device, "size_64", within_s=5.0))
+    image = asyncio.run(download_by_frames(device, "size_64", within_s=PATIENCE_S))
     assert image.pixels == PIXELS.tobytes()
     assert image.repeats == 32  # each of the frames once
 
 
 def test_packets_that_were_lost_are_requested_again():
-    image = asyncio.run(download_by_bursts(Device(lost=(0, 7, 100)), "size_64", within_s=5.0))
+    image = asyncio.run(download_by_bursts(Device(lost=(0, 7, 100)), "size_64", within_s=PATIENCE_S))
     assert (image.pixels, image.repeats) == (PIXELS.tobytes(), 1)
 
 
@@ -122,7 +123,7 @@ class LossyCanDevice(Device):
 @pytest.mark.parametrize("place", range(4), ids=("first", "second", "third", "last"))
 def test_a_lost_can_frame_costs_its_packet_not_the_download(place):
     device = LossyCanDevice((4 * 7 + place, 4 * 100 + place))
-    image = asyncio.run(download_by_bursts(device, "size_64", within_s=5.0))
+    image = asyncio.run(download_by_bursts(device, "size_64", within_s=PATIENCE_S))
     assert (image.pixels, image.repeats) == (PIXELS.tobytes(), 1)
 
 
@@ -160,7 +161,7 @@ def test_a_file_with_another_checksum_than_in_the_list_is_rejected():
 
     device.telemetry = telemetry
     with pytest.raises(BenchError, match=r"the downloaded file has checksum \d+, the list 1"):
-        asyncio.run(download_by_bursts(device, "size_64", within_s=5.0))
+        asyncio.run(download_by_bursts(device, "size_64", within_s=PATIENCE_S))
 
 
 def test_a_refusal_other_than_busy_ends_the_download():
@@ -177,5 +178,5 @@ def test_a_list_still_being_made_is_waited_for():
         return {**await real(name), "updating": next(answers)}
 
     device.telemetry = telemetry
-    (file,) = asyncio.run(list_files(device, within_s=5.0))
+    (file,) = asyncio.run(list_files(device, within_s=PATIENCE_S))
     assert file["size"] == len(FILE)

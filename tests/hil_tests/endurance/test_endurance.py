@@ -36,7 +36,8 @@ from starhil.protocol.icd.codec import Row
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
 
-LIVES, STEPS = 4, 150
+LIVES, STEPS = 2, 150
+"""Of each unit; `make years` has many more."""
 ROOT = Path(__file__).parents[3]
 MUTANTS = tomllib.loads((ROOT / "tests/hil_tests/endurance/mutants.toml").read_text())["mutant"]
 READ_MODE = {"do": "request", "link": "serial", "row": ["", 160, "telemetry"]}

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 
@@ -23,6 +22,7 @@ from starhil.hil_tests.timing.realtime import set_realtime_priority
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import ReplyKind, Request, RequestKind
 from starhil.protocol.unit import load_unit
+from tests.waiting import PATIENCE_S
 
 ICD = load_unit()
 READY = "print('Hello', flush=True); print('ready unit=sagitta serial=/dev/x', flush=True)"
@@ -141,7 +141,7 @@ def test_the_command_is_beside_the_interpreter_or_on_path(monkeypatch, tmp_path)
 def with_parent(parent: int, *command: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", "starhil.hil_tests.rig.end_with_parent", str(parent), *command],
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=PATIENCE_S, check=False,
     )  # fmt: skip
 
 
@@ -165,7 +165,7 @@ def test_the_first_signal_interrupts_and_further_ones_are_ignored():
 
     def send(number):
         os.kill(os.getpid(), number)
-        time.sleep(10.0)
+        signal.pause()
 
     with interruptible(), pytest.raises(Interrupted, match="interrupted by SIGHUP") as caught:
         send(signal.SIGHUP)

@@ -15,6 +15,7 @@ from starhil.hil_tests.reports import prepare_report, write_junit, write_report
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess
 from starhil.hil_tests.rig.rig import LinkOptions, Rig
 from starhil.protocol.unit import load_unit
+from tests.waiting import PATIENCE_S
 
 READY = "import sys, time; print('ready serial=none', flush=True); "
 DIES = READY + "print('Segmentation of the sky', file=sys.stderr); sys.exit(7)"
@@ -38,7 +39,7 @@ def rig(text: str) -> Rig:
 def wait_for_its_end(process: EmulatorProcess, error: Exception | None = None) -> None:
     """Wait until the emulator ends, then raise the error if there is one."""
     if process.command[-1] == DIES:
-        process.process.wait(timeout=60)
+        process.process.wait(timeout=PATIENCE_S)
     if error is not None:
         raise error
 

@@ -30,6 +30,7 @@ from starhil.protocol.unit import load_unit
 from starid.errors import StaridError
 from tests.candump import read_candump
 from tests.hil_tests.fake_device import FakeDevice
+from tests.waiting import PATIENCE_S
 
 ICD = load_unit()
 
@@ -64,7 +65,7 @@ def test_listen_checks_only_messages_after_its_start(device, hub, tmp_path):
     )
     script = load_script(path, ICD)
     pause = threading.Event()
-    with Rig(LinkOptions(can=device.open_can(hub), timeout_s=20.0), ICD) as rig:
+    with Rig(LinkOptions(can=device.open_can(hub), timeout_s=PATIENCE_S), ICD) as rig:
         for number in range(50):  # they pile up before the step
             device.say("precise_attitude", {"frame_counter": number})
         rig.client("can").read("rates")
@@ -442,7 +443,7 @@ def test_one_unsolicited_message_is_judged_without_a_rate(device, hub, tmp_path,
         f"[[step]]\nlisten = 'precise_attitude'\nexpect = {{ frame_counter = {wanted} }}\n", encoding="utf-8"
     )
     script = load_script(path, ICD)
-    with Rig(LinkOptions(can=device.open_can(hub), timeout_s=20.0), ICD) as rig:
+    with Rig(LinkOptions(can=device.open_can(hub), timeout_s=PATIENCE_S), ICD) as rig:
         rig.client("can").read("rates")
         timer = threading.Timer(0.2, device.say, ["precise_attitude", {"frame_counter": 7}])
         timer.start()

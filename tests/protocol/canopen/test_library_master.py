@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from typing import Self
 
 import can
@@ -13,9 +12,9 @@ import pytest
 
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.eds import build_eds
+from tests.waiting import PATIENCE_S, wait_until
 
 FRAME = bytes(number * 7 & 0xFF for number in range(937 * 937))
-PATIENCE_S = 20.0
 BOOT_UP, OPERATIONAL = 0, 5
 """NMT states as in a heartbeat."""
 
@@ -127,14 +126,6 @@ class SlaveThread:
             self._bus.send(can.Message(arbitration_id=frame.id, data=frame.data, is_extended_id=False))
 
 
-def until(condition: Callable[[], bool]) -> None:
-    """Wait until something is true; the deadline only ends a test that fails."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 @pytest.fixture
 def network(new_bench, tmp_path, request):
     eds = tmp_path / "node.eds"
@@ -162,16 +153,16 @@ def test_whole_session_over_a_bus(network):
     reported: list[int] = []
     node.nmt.add_heartbeat_callback(reported.append)
     node.nmt.state = "OPERATIONAL"
-    until(lambda: OPERATIONAL in reported)
+    wait_until(lambda: OPERATIONAL in reported)
     assert received.wait(PATIENCE_S)
     with node.sdo["Frame"]["pixels"].open("rb", block_transfer=True) as file:
         assert file.read() == FRAME[:60_000]
     node.network.send_message(0x80, b"\x01")
-    until(lambda: any(error.code == 0x8240 for error in node.emcy.log))
+    wait_until(lambda: any(error.code == 0x8240 for error in node.emcy.log))
     assert [error.register for error in node.emcy.log if error.code == 0x8240] == [0x11]
     assert BOOT_UP not in reported
     node.nmt.state = "RESET"
-    until(lambda: BOOT_UP in reported)
+    wait_until(lambda: BOOT_UP in reported)
     assert bench.slave.node_id == 0x2C
 
 
@@ -186,4 +177,4 @@ def test_lss_over_a_bus(network):
     lss.configure_node_id(0x31)
     lss.send_switch_state_global(lss.WAITING_STATE)
     network_.nmt.send_command(130)
-    until(lambda: bench.slave.node_id == 0x31)
+    wait_until(lambda: bench.slave.node_id == 0x31)

@@ -20,6 +20,7 @@ from starhil.protocol.icd.codec import Field, Row
 from starhil.protocol.icd.quoting import c_member
 from starhil.protocol.icd.values import Value
 from starhil.protocol.serial.stack import SerialStack
+from tests.waiting import PATIENCE_S
 
 FLAGS = [
     "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",
@@ -326,7 +327,7 @@ class CDriver:
         return self
 
     def __exit__(self, *error: object) -> None:
-        _, errors = self._process.communicate(timeout=60)
+        _, errors = self._process.communicate(timeout=PATIENCE_S)
         assert (self._process.returncode, errors) == (0, "")
 
     def __call__(self, *words: object) -> list[str]:

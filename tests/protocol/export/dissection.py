@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.waiting import PATIENCE_S
+
 FIELDS = ("can.id", "can.flags.xtd", "frame.protocols", "_ws.malformed", "_ws.col.Info")
-TIME_OUT_S = 120
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ def dissect(recording: Path) -> list[Dissected]:
     command = [tshark, "-r", str(recording), "-d", "can.subdissector,canopen", "-T", "fields"]
     for field in FIELDS:
         command += ["-e", field]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=TIME_OUT_S, check=True)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     frames = []
     for line in done.stdout.splitlines():
         identifier, extended, protocols, malformed, words = line.split("\t")

@@ -3,6 +3,7 @@
 import os
 import re
 import socket
+import time
 
 import pytest
 
@@ -61,6 +62,21 @@ def test_toml_has_only_values_that_something_can_use(name):
     text, reason = UNUSABLE[name]
     with pytest.raises(TomlError, match=reason.partition("|")[0]):
         parse_toml(text)
+
+
+@pytest.mark.parametrize("part", ["a", '"a b"', "'c'"])
+@pytest.mark.parametrize("line", ["{} = 1", "[{}]", "[[{}]]", "x = [1, {{ y = 2, {} = 1 }}]"])
+def test_keys_of_very_many_parts_are_rejected_in_a_time_that_grows_with_their_length(line, part):
+    text = "# line\n" + line.format(" . ".join([part] * 100_000))
+    begin_s = time.process_time()
+    with pytest.raises(TomlError, match=r"nested too deeply \(at line 2\)"):
+        parse_toml(text)
+    assert time.process_time() - begin_s < 1.0  # Python alone takes 100 s
+
+
+def test_text_with_many_points_is_no_deep_key():
+    points = ".".join("a" * 100)
+    assert parse_toml(f"# {points}\na = '{points}' # {points}\nb = ['{points}', \"{points}\"]")["a"] == points
 
 
 def test_whole_numbers_of_64_bits_and_deep_tables_are_read():

@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import os
 import tty
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
@@ -18,7 +18,6 @@ from starhil.protocol.transports.hub import CanHub
 from starhil.protocol.transports.paced import SerialTransport
 from starhil.protocol.transports.serial import open_serial
 
-DEADLINE_S = 10.0
 HAS_VCAN = kernel_can_is_up("vcan0")
 
 SERIAL_KINDS = ["pty and tty", "listen and socket"]
@@ -40,19 +39,6 @@ CAN_KINDS = [
         "socketcan", marks=[pytest.mark.socketcan, pytest.mark.skipif(not HAS_VCAN, reason="no vcan0 here")]
     ),
 ]
-
-
-async def until(condition: Callable[[], bool]) -> None:
-    """Wait until something is true; the deadline only ends a test that fails."""
-    async with asyncio.timeout(DEADLINE_S):
-        while not condition():
-            await asyncio.sleep(0.002)
-
-
-async def turns(count: int = 50) -> None:
-    """Let the loop do what is due, if there is anything."""
-    for _ in range(count):
-        await asyncio.sleep(0)
 
 
 class SerialPair:

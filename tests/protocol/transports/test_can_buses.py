@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import socket
 import subprocess
 import threading
 import time
@@ -11,13 +12,15 @@ from itertools import pairwise
 
 import can
 import pytest
+from can.interfaces.udp_multicast.utils import pack_message
 
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import TURN_S, TransportError
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.python_can import QUEUE_LIMIT, PythonCanTransport
-from tests.protocol.transports.pairs import CAN_KINDS, DEADLINE_S, FRAMES, HAS_VCAN, CanPair, can_pair, until
+from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, CanPair, can_pair
+from tests.waiting import PATIENCE_S, until
 
 MARK = CanFrame(0x7A5, b"end", extended=False)
 
@@ -80,7 +83,7 @@ def test_a_burst_leaves_the_loop_to_others_after_some_15_frames(kind: str) -> No
             counts = [0]
             for number in range(300):
                 pair.one.send(CanFrame(number, bytes(8), extended=False))
-            async with asyncio.timeout(DEADLINE_S):
+            async with asyncio.timeout(PATIENCE_S):
                 while counts[-1] < 300:
                     await asyncio.sleep(0)
                     counts.append(len(pair.got_two))
@@ -97,7 +100,7 @@ def test_frames_that_are_much_work_leave_the_loop_to_others_one_by_one(kind: str
             counts = [0]
             for number in range(60):
                 pair.one.send(CanFrame(number, bytes(8), extended=False))
-            async with asyncio.timeout(DEADLINE_S):
+            async with asyncio.timeout(PATIENCE_S):
                 while counts[-1] < 60:
                     await asyncio.sleep(0)
                     counts.append(len(pair.got_two))
@@ -270,6 +273,45 @@ def test_a_bus_that_fails_while_it_is_read_is_reported_once_and_opened_again() -
             "CAN scripted:0: lost: interface gone; waiting for it to come back"
         ]
         await transport.close()
+
+    asyncio.run(main())
+
+
+def test_datagrams_that_are_no_frames_do_not_interrupt_a_bus_of_udp() -> None:
+    group = "239.74.163.77"
+
+    async def main() -> None:
+        one, two = open_can(f"udp_multicast:{group}"), open_can(f"udp_multicast:{group}")
+        got: list[CanFrame] = []
+        errors: list[ProtocolError] = []
+        await one.start(got.append, errors.append)
+        await two.start(lambda _frame: None, errors.append)
+        known = pack_message(can.Message(arbitration_id=5))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+            for number in range(200):
+                junk = (b"", b"\xff" * 9, b"\x91" * 5000, known[:-3], known + b"\0")[number % 5]
+                stranger.sendto(junk, (group, 43113))
+                assert two.send(CanFrame(number))
+                await asyncio.sleep(0.001)
+        await until(lambda: len(got) == 200)
+        assert [frame.id for frame in got] == list(range(200))
+        assert (errors, one.statistics.reconnects, one.statistics.dropped) == ([], 0, 200)
+        await one.close()
+        await two.close()
+
+    asyncio.run(main())
+
+
+def test_a_frame_that_no_node_can_send_is_dropped() -> None:
+    async def main() -> None:
+        bus = _ScriptedBus(
+            can.Message(arbitration_id=0x12345, is_extended_id=False), can.Message(arbitration_id=5)
+        )
+        transport, got, errors = await _open(bus)
+        await until(lambda: bool(got))
+        await transport.close()
+        assert ([frame.id for frame in got], errors, transport.statistics.dropped) == ([5], [], 1)
 
     asyncio.run(main())
 

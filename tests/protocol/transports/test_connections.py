@@ -13,7 +13,7 @@ from starhil.protocol.can.socketcand import format_send
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.connections import WINDOW
 from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub, FairQueue
-from tests.protocol.transports.pairs import turns, until
+from tests.waiting import PATIENCE_S, turns, until
 
 FLOOD = CanFrame(0x123, bytes(8), extended=False)
 REQUEST = CanFrame(0x200, b"\x01", extended=False)
@@ -82,7 +82,7 @@ def test_a_flood_takes_the_place_of_no_other_clients_frame() -> None:
         await until(lambda: hub.statistics.frames > before)
         await turns()
         reader._transport.resume_reading()  # type: ignore[attr-defined]
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(PATIENCE_S):
             while b" 200 " not in await reader.readuntil(b">"):
                 pass
         writer.close()
@@ -125,7 +125,7 @@ def test_a_request_is_answered_before_most_of_a_flood_that_came_first() -> None:
         await bench.drain()
         await turns()
         device._writer.transport.resume_reading()  # type: ignore[attr-defined]
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(PATIENCE_S):
             while not heard:  # on a busy machine the device's own flood can push its reply out
                 with contextlib.suppress(TimeoutError):
                     async with asyncio.timeout(3.0):
@@ -156,10 +156,10 @@ def test_a_client_stops_reading_while_the_hub_does_not_accept_its_frames() -> No
         device = open_can(f"socketcand:127.0.0.1:{server.sockets[0].getsockname()[1]}/vcan0")
         await device.start(lambda _: [device.send(FLOOD) for _ in range(10)])
         received = -1
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(PATIENCE_S):
             while device.statistics.received != received:
                 received = device.statistics.received
-                await asyncio.sleep(0.2)
+                await turns(200)  # in which the server would have sent more
         assert device._writer.transport.get_write_buffer_size() < 10 * WINDOW  # type: ignore[attr-defined]
         await device.close()
         server.close()

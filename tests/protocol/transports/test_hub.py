@@ -24,8 +24,7 @@ from starhil.protocol.can.socketcand import (
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub
 from tests.candump import read_candump
-
-PATIENCE_S = 20.0
+from tests.waiting import PATIENCE_S
 
 
 class Peer:
@@ -143,6 +142,24 @@ def test_malformed_commands_are_answered_by_an_error_and_change_nothing(text: st
         one.write("< send 123 1 1 >")
         assert (await two.frame()).id == 0x123
         assert hub.statistics.errors >= 1
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("text", [">", "<>", "<a>", "< send >", "<x", "x"])
+def test_answers_to_a_flood_of_malformed_commands_are_no_multiple_of_it(text: str) -> None:
+    async def scenario(hub: CanHub) -> None:
+        one, two = await Peer.join(hub), await Peer.join(hub)
+        flood = text * (64_000 // len(text))
+        one.write(flood)
+        one.write("> < echo >")
+        answer = ""
+        while "< echo >" not in answer:
+            answer += await one.read()
+        assert answer.startswith("< error ")
+        assert len(answer) < len(flood) / 20
+        one.write("< send 123 1 1 >")
+        assert (await two.frame()).id == 0x123
 
     run(scenario)
 

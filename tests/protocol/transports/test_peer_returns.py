@@ -18,7 +18,8 @@ from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.hub import CanHub
 from starhil.protocol.transports.paced import SerialTransport
 from starhil.protocol.transports.serial import open_serial
-from tests.protocol.transports.pairs import FRAMES, until
+from tests.protocol.transports.pairs import FRAMES
+from tests.waiting import until
 
 SLOW_BAUD = 9600
 QUEUED = (bytes(120),) * 100

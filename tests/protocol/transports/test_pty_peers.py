@@ -13,7 +13,7 @@ import pytest
 from starhil.protocol.transports import pty
 from starhil.protocol.transports.paced import SerialTransport
 from starhil.protocol.transports.serial import open_serial
-from tests.protocol.transports.pairs import turns, until
+from tests.waiting import turns, until
 
 MESSAGE = bytes(range(100))
 REQUEST = b"request"

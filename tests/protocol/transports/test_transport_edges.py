@@ -7,7 +7,7 @@ import pytest
 from starhil.protocol.transports.base import TransportError
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.serial import open_serial
-from tests.protocol.transports.pairs import until
+from tests.waiting import until
 
 
 @pytest.mark.parametrize("host", ["127.0.0..1", "x" * 300])

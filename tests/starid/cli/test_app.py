@@ -19,6 +19,7 @@ from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.cli import app, identify
 from tests.emulator.cli.command_line import run_command_line
+from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -43,7 +44,7 @@ def test_a_photograph_is_identified_without_the_packages_of_the_bench_and_the_la
     program = "from starid.cli import main; main()"
     done = subprocess.run(
         [sys.executable, "-X", "importtime", "-c", program, "identify", photograph, "--fov", "20", "--json"],
-        capture_output=True, text=True, timeout=300, check=True,
+        capture_output=True, text=True, timeout=PATIENCE_S, check=True,
     )  # fmt: skip
     assert json.loads(done.stdout)["valid"]
     imported = {line.split("|")[-1].strip() for line in done.stderr.splitlines() if "|" in line}
@@ -77,7 +78,7 @@ def test_no_sub_command_has_two_programs() -> None:
 def test_only_the_module_of_the_given_sub_command_is_imported() -> None:
     program = "import sys; from starid.cli import app; app.build_app(['catalog']); print(*sys.modules)"
     done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=PATIENCE_S, check=True
     )
     loaded = {name for name in done.stdout.split() if name in app.COMMANDS.values()}
     assert loaded == {"starid.cli.catalog"}

@@ -19,6 +19,7 @@ from starid.arrays import Array
 from starid.kernels import kernel_cache
 from starid.kernels.jit import compiled, compiled_ieee, inner, inner_checked
 from starid.storage.cache import cached_files, remove
+from tests.waiting import PATIENCE_S
 
 CALLER = """
 from other_kernels.inner import FACTOR, scaled
@@ -80,7 +81,7 @@ def process(folder: Path) -> subprocess.Popen[str]:
 
 def run(folder: Path, warning: str = "") -> list[str]:
     """Result of the kernel in a new process, and how often its machine code was loaded."""
-    out, errors = process(folder).communicate(timeout=300)
+    out, errors = process(folder).communicate(timeout=PATIENCE_S)
     assert (warning in errors) if warning else not errors, errors
     return out.split()
 
@@ -201,7 +202,7 @@ def test_a_damaged_list_of_checksums_is_written_again(cache_folder: Path, text: 
 def test_processes_that_start_together_on_an_empty_cache_all_get_the_result(tmp_path: Path) -> None:
     write_package(tmp_path)
     started = [process(tmp_path) for _ in range(3)]
-    ended = [each.communicate(timeout=300) for each in started]
+    ended = [each.communicate(timeout=PATIENCE_S) for each in started]
     assert [(out.split()[0], errors) for out, errors in ended] == [("2.5", "")] * 3
     assert run(tmp_path) == ["2.5", "1"]
 

@@ -21,6 +21,7 @@ from starid.identification.thesis.database import DatabaseError
 from starid.identification.thesis.database_file import load_database
 from starid.imaging.image_io import read_image, write_image
 from starid.storage.files import read_bytes, read_number, read_text, write_atomically
+from tests.waiting import PATIENCE_S
 
 READERS = [
     (read_image, StaridError),
@@ -82,10 +83,12 @@ def test_standard_output_is_written_in_place(tmp_path: Path, *, into_file: bool)
     command = [sys.executable, "-c", program, str(link)]
     if into_file:
         with file.open("wb") as stream:
-            subprocess.run(command, stdout=stream, check=True, timeout=120)
+            subprocess.run(command, stdout=stream, check=True, timeout=PATIENCE_S)
         said = file.read_text()
     else:
-        said = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, timeout=120).stdout
+        said = subprocess.run(
+            command, stdout=subprocess.PIPE, text=True, check=True, timeout=PATIENCE_S
+        ).stdout
     assert said == "before\nwhole\nafter\n"
     assert link.is_symlink()
 
@@ -97,7 +100,7 @@ def test_a_stream_without_a_suffix_gets_a_png(tmp_path: Path) -> None:
     reader = threading.Thread(target=lambda: seen.append(pipe.read_bytes()), daemon=True)
     reader.start()
     write_image(pipe, np.arange(64, dtype=np.uint8).reshape(8, 8))
-    reader.join(timeout=60.0)
+    reader.join(timeout=PATIENCE_S)
     assert seen[0].startswith(b"\x89PNG")
 
 
@@ -123,7 +126,7 @@ def test_only_regular_files_are_read(
     )
     names = [reader.__module__, reader.__name__, error_type.__module__, error_type.__name__]  # type: ignore[attr-defined]
     done = subprocess.run(
-        [sys.executable, "-c", program, *names, str(path)], capture_output=True, text=True, timeout=120
+        [sys.executable, "-c", program, *names, str(path)], capture_output=True, text=True, timeout=PATIENCE_S
     )
     wanted = "Is a directory" if kind == "folder" else "not a regular file"
     assert wanted in done.stdout, done.stderr[-300:]

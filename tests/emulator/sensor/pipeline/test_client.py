@@ -20,10 +20,9 @@ from starhil.emulator.sensor.pipeline.messages import (
 from starhil.emulator.sensor.pipeline.worker_process import WorkerThread
 from tests.emulator.runs import CAMERA
 from tests.emulator.workers import ANSWERING, WORKER
-from tests.protocol.transports.pairs import turns
+from tests.waiting import PATIENCE_S, turns, until
 
 SETUP = pipeline_setup(Profile())
-WITHIN_S = 20.0
 REQUEST = ImageRequest(64)
 
 
@@ -64,8 +63,8 @@ def run(imager_of, scenario):
     async def whole():
         imager = imager_of()
         try:
-            await asyncio.wait_for(imager.start(), WITHIN_S)
-            await asyncio.wait_for(scenario(imager), WITHIN_S)
+            await asyncio.wait_for(imager.start(), PATIENCE_S)
+            await asyncio.wait_for(scenario(imager), PATIENCE_S)
         finally:
             await imager.close()
 
@@ -98,8 +97,7 @@ def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_p
         imager.kill()
         imager.submit(REQUEST, answers.append)
         await imager.settle()
-        while not losses:
-            await asyncio.sleep(0.01)
+        await until(lambda: losses)
         imager.submit(REQUEST, answers.append)
         assert [type(answer) for answer in answers] == [PipelineEnded, PipelineEnded]
         await imager.restart()
@@ -133,8 +131,7 @@ def test_a_failure_handler_that_fails_keeps_no_request_pending(make_pipeline, ca
         imager.kill()
         imager.submit(REQUEST, lambda _answer: None)
         await imager.settle()
-        while "ZeroDivisionError" not in caplog.text:
-            await asyncio.sleep(0.01)
+        await until(lambda: "ZeroDivisionError" in caplog.text)
 
     run(make_pipeline, scenario)
 
@@ -151,8 +148,7 @@ def test_an_answer_that_cannot_be_read_loses_the_worker_and_is_logged(worker, ca
     async def scenario(imager):
         imager.ended.connect(losses.append)
         imager.submit(REQUEST, answers.append)
-        while not losses:
-            await asyncio.sleep(0.01)
+        await until(lambda: losses)
         await imager.settle()
         imager.submit(REQUEST, answers.append)
         assert isinstance(answers[-1], Failure)
@@ -178,7 +174,7 @@ def test_a_start_that_fails_raises_once_and_is_no_loss(worker, program):
         imager.ended.connect(losses.append)
         try:
             with pytest.raises(EmulatorError, match=r"no catalogue|pipeline worker"):
-                await asyncio.wait_for(imager.start(), WITHIN_S)
+                await asyncio.wait_for(imager.start(), PATIENCE_S)
             await turns()
         finally:
             await imager.close()
@@ -206,7 +202,7 @@ def test_a_thread_whose_pipeline_cannot_be_made_reports_it(monkeypatch):
         imager = WorkerClient(SETUP, WorkerThread())
         try:
             with pytest.raises(EmulatorError, match="ValueError: odd camera"):
-                await asyncio.wait_for(imager.start(), WITHIN_S)
+                await asyncio.wait_for(imager.start(), PATIENCE_S)
         finally:
             await imager.close()
 

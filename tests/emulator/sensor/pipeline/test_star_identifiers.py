@@ -18,11 +18,11 @@ from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.errors import StaridError
+from tests.waiting import PATIENCE_S
 
 DEEP = StarIdentifierSetup("geometric", DEFAULT_CAMERA, 1.0, (("limiting_magnitude", 6.0),))
 SHALLOW = replace(DEEP, options=(("limiting_magnitude", 5.0),))
 WIDE = replace(DEEP, margin=2.0)
-WITHIN_S = 60.0
 ACCURACY_ARCSEC = 20.0
 
 
@@ -43,7 +43,7 @@ class Factory:
         self.ended = threading.Semaphore(0)
 
     def __call__(self, choice):
-        assert self.go.wait(WITHIN_S)
+        assert self.go.wait(PATIENCE_S)
         self.made.append(choice)
         try:
             if dict(choice.options)["limiting_magnitude"] < 0.0:
@@ -53,10 +53,10 @@ class Factory:
             self.ended.release()
 
     def wait_for_thread(self) -> None:
-        assert self.ended.acquire(timeout=WITHIN_S)
+        assert self.ended.acquire(timeout=PATIENCE_S)
         for thread in threading.enumerate():
             if thread.name == "identifier":
-                thread.join(WITHIN_S)
+                thread.join(PATIENCE_S)
 
 
 @pytest.fixture
@@ -178,6 +178,6 @@ def test_frames_are_solved_while_another_index_is_built_and_then_the_new_limit_h
     assert meanwhile.matched == before.matched
     begin = time.monotonic()
     while (after := solve(bright)).index_pending:
-        assert time.monotonic() - begin < WITHIN_S
+        assert time.monotonic() - begin < PATIENCE_S
     assert after.matched < before.matched
     assert max(magnitude[star.hip] for star in after.stars) <= 4.0

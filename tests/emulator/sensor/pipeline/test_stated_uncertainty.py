@@ -7,6 +7,7 @@ with a standard deviation of √(2/(kn)).
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -48,6 +49,7 @@ def test_an_error_of_the_calibration_is_not_taken_for_noise_about_the_boresight(
 RATES = [(2.0, 200), (5.0, 100), (5.0, 200)]
 
 
+@cache
 def errors_of_trails(rate_deg_s: float, exposure_ms: int) -> np.ndarray:
     return errors_over_stated("ideal", rate_deg_s, 200, f"parameters.exposure={exposure_ms}")
 

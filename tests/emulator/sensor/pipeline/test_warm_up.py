@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from tests.waiting import PATIENCE_S
+
 pytestmark = pytest.mark.process
 
 SCRIPT = """
@@ -50,7 +52,11 @@ print(len(before), sorted(kernels() - before))
 @pytest.mark.parametrize("profile", ["ideal", "cubestar"])
 def test_no_kernel_is_left_to_be_compiled_in_a_slew(profile):
     done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, profile], capture_output=True, text=True, timeout=600, check=False
+        [sys.executable, "-c", SCRIPT, profile],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     count, _, late = done.stdout.strip().partition(" ")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import math
 from dataclasses import dataclass
 from functools import cache
@@ -78,9 +80,16 @@ def stars():
 
 
 @cache
-def solver(name: str, *, verify: bool) -> ClassicIdentifier:
-    made = make_identifier(name, CAMERA, limiting_magnitude=LIMIT, zero_point=0.0, verify=verify)
+def verifying(name: str) -> ClassicIdentifier:
+    made = make_identifier(name, CAMERA, limiting_magnitude=LIMIT, zero_point=0.0)
     assert isinstance(made, ClassicIdentifier)
+    return made
+
+
+def solver(name: str, *, verify: bool) -> ClassicIdentifier:
+    """The identifier, with one database whether it verifies or not."""
+    made = copy.copy(verifying(name))
+    made.options = dataclasses.replace(made.options, verify=verify)
     return made
 
 

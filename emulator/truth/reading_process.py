@@ -1,0 +1,173 @@
+"""Truth and orbit files are read in a process of their own, unless they are small text.
+
+Whoever makes such a file decides how long it takes to read, how much memory that needs, and what SPICE, a library in C,
+does with it. Here none of this delays a reply, keeps the run from its end, or ends it: the process has half of the
+machine's memory, and ends with the one that has started it.
+
+It writes one line of JSON, either the problems, or what is not an array and the number of arrays; and then the arrays, as `numpy.save` does.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import astuple
+from pathlib import Path
+from types import SimpleNamespace
+from typing import IO, Any, Final, Literal, TypeAlias
+
+import numpy as np
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.simulation.parent_death_signal import end_with_parent
+from starhil.emulator.truth.file import read_orbit_file, read_truth_file
+from starhil.emulator.truth.spice_file import META_KERNEL
+from starhil.emulator.truth.table import Attitudes, FileTruth, Orbits, OrbitTable, Span
+from starid.errors import StaridError
+
+log = logging.getLogger("starhil.truth")
+
+AT_ONCE_BYTES: Final = 500_000
+"""Size up to which a text is read in the process of the run, which takes a thread of it half a second."""
+
+Kind: TypeAlias = Literal["truth", "orbit"]
+
+
+def read_truth(path: Path) -> FileTruth:
+    """Read a truth file, as `file.read_truth_file` does."""
+    if _is_small_text(path):
+        return read_truth_file(path)
+    content, (times, quaternions, *others) = _read_apart("truth", path)
+    rates, states = (others.pop(0) if content[name] else None for name in ("has_rates", "has_orbit"))
+    return FileTruth(
+        times,
+        Attitudes(quaternions),
+        rates,
+        None if states is None else Orbits(states),
+        spans=_spans(content),
+        smooth=content["smooth"],
+        start_unix_s=content["start_unix_s"],
+    )
+
+
+def read_orbit(path: Path) -> OrbitTable:
+    """Read an orbit file, as `file.read_orbit_file` does."""
+    if _is_small_text(path):
+        return read_orbit_file(path)
+    content, (times, states) = _read_apart("orbit", path)
+    return OrbitTable(path, times, Orbits(states), _spans(content))
+
+
+def _is_small_text(path: Path) -> bool:
+    """Return whether a file can be read in this process, or not at all, so that reading it says why."""
+    try:
+        return path.stat().st_size <= AT_ONCE_BYTES and not _begins_as_kernel(path)
+    except (OSError, ValueError):
+        return True
+
+
+def _begins_as_kernel(path: Path) -> bool:
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return META_KERNEL.encode() in file.read(2 * len(META_KERNEL))
+
+
+def _spans(content: dict[str, Any]) -> list[Span]:
+    return [Span(*values) for values in content["spans"]]
+
+
+def _read_apart(kind: Kind, path: Path) -> tuple[dict[str, Any], list[Any]]:
+    """Return what another process reads of a file."""
+    command = [sys.executable, "-P", "-m", __name__, kind, str(path), str(os.getpid())]
+    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as process:  # noqa: S603
+        if process.stdout is None:
+            raise RuntimeError("no pipe")
+        try:
+            content = json.loads(process.stdout.readline())
+            if "problems" not in content:
+                for text in content["warnings"]:
+                    log.warning("%s", text)
+                # a file would be asked for its position
+                pipe: Any = SimpleNamespace(read=process.stdout.read)
+                arrays = [
+                    np.lib.format.read_array(pipe, allow_pickle=False) for _ in range(content["arrays"])
+                ]
+                return content, arrays
+        except ValueError:  # it has ended before the end
+            content = None
+        finally:
+            process.kill()
+    if content is not None:
+        raise EmulatorError(*content["problems"])
+    code = process.returncode
+    how = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
+    raise EmulatorError(f"{kind} file {path}: cannot be read (the process that reads it has ended {how})")
+
+
+# --- the other process ---
+
+
+class _Warnings(logging.Handler):
+    """Collects warnings about a file."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.texts.append(record.getMessage())
+
+
+def main(kind: str, path: Path, out: IO[bytes]) -> None:
+    """Read a file, and write what it contains."""
+    warnings = _Warnings()
+    log.addHandler(warnings)
+    log.propagate = False
+    arrays: Sequence[Any] = ()
+    try:
+        content, arrays = _truth_of(path) if kind == "truth" else _orbit_of(path)
+        content |= {"warnings": warnings.texts, "arrays": len(arrays)}
+    except (EmulatorError, StaridError) as error:
+        content = {"problems": list(getattr(error, "problems", (str(error),)))}
+    except MemoryError:
+        content = {"problems": [f"{kind} file {path}: cannot be read (not enough memory)"]}
+    out.write(json.dumps(content).encode() + b"\n")
+    for array in arrays:
+        np.save(out, array, allow_pickle=False)
+    out.flush()
+
+
+def _truth_of(path: Path) -> tuple[dict[str, Any], list[Any]]:
+    truth = read_truth_file(path)
+    optional = [truth.rates_rad_s, None if truth.orbit is None else Orbits.array_of(truth.orbit)]
+    content = {
+        "spans": [astuple(span) for span in truth.spans],
+        "smooth": truth.smooth,
+        "start_unix_s": truth.start_unix_s,
+        "has_rates": optional[0] is not None,
+        "has_orbit": optional[1] is not None,
+    }
+    arrays = [truth.times_s, Attitudes.array_of(truth.attitudes), *optional]
+    return content, [array for array in arrays if array is not None]
+
+
+def _orbit_of(path: Path) -> tuple[dict[str, Any], list[Any]]:
+    table = read_orbit_file(path)
+    return {"spans": [astuple(span) for span in table.spans]}, [
+        table.times_unix_s,
+        Orbits.array_of(table.states),
+    ]
+
+
+if __name__ == "__main__":
+    end_with_parent(int(sys.argv[3]))
+    limit = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    main(sys.argv[1], Path(sys.argv[2]), sys.stdout.buffer)
