@@ -3,7 +3,7 @@
 # make check       for whoever edits, a minute and a half: ruff, contracts of imports, and tests without processes and long computations
 # make lowest      the tests of LOWEST with the lowest versions of dependencies that pyproject.toml admits
 # make versions    the same tests with the newest dependencies on VERSIONS of Python, on the Debians that have them (as root, on Debian)
-# make arm64       the same bytes as here on an emulated arm64, and on the processor of an older server (as root, on Debian; TIME)
+# make arm64       the same bytes as here on an emulated arm64, and on the processor of an older server (as root, on Debian; an hour)
 # make lint        ruff, mypy --strict and the contracts of imports
 # make docs        pages and API reference in out/docs; a warning or a broken link fails
 # make reproduce   every experiment of the thesis again; report.md, tables and plots in out/reproduce
