@@ -42,12 +42,17 @@ _ALGORITHM_COLUMNS: Final[tuple[Column, ...]] = (
     ("algorithm", lambda row: row["algorithm"]),
     ("frames", lambda row: str(row["frames"])),
     ("valid %", _number("valid_pct", 1)),
+    ("1 SE", _number("standard_error_pct", 1)),
     ("wrong", lambda row: str(row["wrong"])),
     ("within .3 %", _number("within_pct", 1)),
     ("across deg", _number("across_deg", 4)),
     ("about deg", _number("about_deg", 4)),
+    ("stated deg", _number("stated_deg", 4)),
     ("chi2", _number("normalised_squared_error", 2)),
+    ("region", lambda row: str(row["in_region"])),
     ("triggers", lambda row: str(row["triggers"])),
+    ("stars kept %", _number("true_kept_pct", 0)),
+    ("false kept %", _number("false_kept_pct", 0)),
     ("ms", _number("median_ms", 2)),
     ("p99 ms", _number("p99_ms", 1)),
     ("kB", _number("kilobytes", 0)),
@@ -322,6 +327,20 @@ def algorithms(
     lost_only: Annotated[
         bool, typer.Option("--lost-only", help="Only images at random attitudes with nothing wrong.")
     ] = False,
+    scene: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TEXT", help="Only conditions with this text in their name, such as '0.3 deg/s'."
+        ),
+    ] = None,
+    part: Annotated[
+        str | None,
+        typer.Option(
+            "--without",
+            metavar="PART",
+            help="Take away a part of the thesis's algorithms: features, weights, motion or region.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare geometric, thesis, and thesis with refinement on the same rendered images.
@@ -331,9 +350,10 @@ def algorithms(
     is wrong.
     """
     from starhil.emulator.benchmarks.algorithms import SCENES, AlgorithmPlan, run_algorithms
+    from starid.identification.thesis.ablations import checked_part
 
-    plan = AlgorithmPlan(profile, frames, seed, tuple(with_orbit(setting, orbit)))
-    scenes = SCENES[:1] if lost_only else SCENES
+    plan = AlgorithmPlan(profile, frames, seed, tuple(with_orbit(setting, orbit)), checked_part(part))
+    scenes = SCENES[:1] if lost_only else tuple(each for each in SCENES if (scene or "") in each.name)
     rows = list(_with_progress(run_algorithms(plan, scenes), 3 * len(scenes)))
     if as_json:
         print(json.dumps(rows))

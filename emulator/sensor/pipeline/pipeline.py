@@ -48,7 +48,7 @@ from starhil.emulator.sensor.sky.objects import EarthLimb, Moon, SkyObjects, Sun
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.simulation.guard import one_line
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
-from starid.arrays import Array
+from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.camera.calibration import attitude_covariance
@@ -129,6 +129,12 @@ class _Exposure:
     in_field: tuple[str, ...] = ()
     frame: Frame | None = None
     objects: SkyObjects = field(default_factory=SkyObjects)
+
+    def false_stars(self, xy_px: Array) -> Mask:
+        """Which positions (n, 2) are those of false stars; none if the image was not rendered."""
+        if self.frame is None or self.frame.objects is None:
+            return np.zeros(len(xy_px), dtype=np.bool_)
+        return near_any(xy_px, self.frame.objects.false_xy_px)
 
 
 class Pipeline:
@@ -256,8 +262,8 @@ class Pipeline:
             seen = stars_seen(stars.xy_px[stars.visible], found.xy_px) if exposure.in_field else 0
             enough = seen >= request.settings.min_stars_matched
             result = with_bodies(result, exposure.in_field, enough_stars=enough)
-            if solution.features is not None and exposure.frame.objects is not None:
-                false = near_any(found.xy_px, exposure.frame.objects.false_xy_px)
+            if solution.features is not None:
+                false = exposure.false_stars(found.xy_px)
                 removed = list(solution.features.removed_index)
                 counts = int(np.count_nonzero(false)), int(np.count_nonzero(false[removed]))
                 result = replace(result, false_detected=counts[0], false_removed=counts[1])
@@ -265,10 +271,12 @@ class Pipeline:
             result = replace(result, preview=self._preview(exposure, sensor, found, solution))
         return result if current else replace(result, index_pending=True)
 
-    def detections(self, request: FrameRequest) -> Detections:
-        """Take the image of a request and return its detections."""
+    def detections(self, request: FrameRequest) -> tuple[Detections, Mask]:
+        """Take the image of a request and return its detections, and which of them are false stars."""
         sensor = self._sensor.with_(exposure_s=request.exposure_s, gain=request.gain)
-        return self._detect(self._expose(request), request, sensor)
+        exposure = self._expose(request)
+        found = self._detect(exposure, request, sensor)
+        return found, exposure.false_stars(found.xy_px)
 
     def identifier(self, request: FrameRequest) -> StarIdentifier:
         """Return the star identifier for the parameters of a request."""
