@@ -116,7 +116,9 @@ def test_faults_of_telemetry_and_clock_and_waits_for_a_phase_are_repeated_to_the
         async with Control(emulation) as control:
             assert (await control.do("wait", phase="mid_frame"))["ok"]
             assert (await control.do("fault", telemetry=faults, phase="exposure"))["ok"]
-            assert (await control.do("fault", clock={"jump_s": -3.0, "drift_ppm": 80.0, "jitter_s": 0.005}))["ok"]
+            assert (await control.do("fault", clock={"jump_s": -3.0, "drift_ppm": 80.0, "jitter_s": 0.005}))[
+                "ok"
+            ]
             assert (await control.do("wait", phase="readout"))["ok"]
         await talk_over_a_bad_wire(emulation)
         async with Control(emulation) as control:
