@@ -319,8 +319,10 @@ def test_signals_of_the_host_do_not_disturb_a_step(tumbling: tuple[Unit, Iterato
     before = signal.signal(signal.SIGALRM, lambda number, _frame: seen.append(number))
     try:
         signal.setitimer(signal.ITIMER_REAL, 1e-3, 1e-3)
-        for row in islice(motion, 25):
+        for row in islice(motion, 100):
             unit.step(row)
+            if len(seen) > 20:  # Python handles those of a call as one, after it
+                break
         assert unit.get("valid")
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
