@@ -57,10 +57,11 @@ lane-emulator: TESTS := tests $(addprefix --ignore=,$(WAITING) $(COMPUTING))
 lane-computing: TESTS := $(COMPUTING)
 lane-emulator lane-computing: PRIORITY := nice
 REPORTS := out/tests
+WARM := $(BIN)/starhil cache warm
 test: $(VENV)/.developer
 	-@tools/install_test_packages tests obc
 	@rm -rf $(REPORTS); mkdir -p $(REPORTS); for lane in $(LANES); do echo "ended without a report" >$(REPORTS)/$$lane.reason; done
-	@$(BIN)/starhil cache warm
+	@$(WARM)
 	@status=0; $(MAKE) --no-print-directory --jobs=$$(nproc) --keep-going --output-sync=target $(BESIDE) $(LANES:%=lane-%) || status=1; \
 		[ $$status = 0 ] && echo "all passed" || echo "some failed: see the lines FAILED and ERROR above"; \
 		$(BIN)/python tools/tier_table.py $(REPORTS); exit $$status

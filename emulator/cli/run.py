@@ -45,6 +45,10 @@ class Key:
     """Returns the value of the key for the nth head; folders and links differ by head."""
 
 
+def _unit(unit: str, _number: int) -> str:
+    return absolute_unit(unit)
+
+
 def _state_dir(folder: Path, number: int) -> str:
     own_folder = "" if number == 1 else f"head-{number}"  # in the folder of the first
     return str(folder.resolve() / own_folder)
@@ -60,7 +64,7 @@ def _symlink(path: Path, number: int) -> str:
 class DeviceOptions:
     """What replaces keys of the profile of every head; an option that names no key changes nothing."""
 
-    unit: Annotated[UnitChoice, Key("unit", lambda unit, _number: absolute_unit(unit))] = None
+    unit: Annotated[UnitChoice, Key("unit", _unit)] = None
     serial: Annotated[
         str | None,
         Key("links.serial.port"),

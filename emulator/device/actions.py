@@ -103,6 +103,13 @@ def save_image(device: Device, arguments: Arguments) -> None:
     device.images.save(edge_of(str(arguments["image_size"])))
 
 
+def convert_image(device: Device, arguments: Arguments) -> None:
+    """Compress a stored image into a file of its own; the images are grey, so that `white_balance` has no effect."""
+    if device.images.state.conversion.result == "busy":
+        raise Refused(ErrorCode.BUSY)
+    device.images.convert(int(arguments["file_counter"]), int(arguments["quality"]))
+
+
 def set_mode(device: Device, arguments: Arguments) -> None:
     """Change the mode."""
     if not device.command_mode(Mode(str(arguments["mode"]))):

@@ -1,6 +1,6 @@
 """Files for download: their list, loading in blocks, bursts of numbered packets, and the hole map of received packets.
 
-The files are the stored images as `bmp`, and an `index` with 12 bytes per image: `<type u8, counter u8, edge u16,
+The files are the stored images as `bmp`, those compressed from them as `jpg`, and an `index` with 12 bytes per file: `<type u8, counter u8, edge u16,
 size u32, frame u32>`. The layout of the index is not public; this one is our own choice.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from starhil.emulator.device.images import ImageStore
-from starhil.emulator.device.stored_images import BMP_TYPE, FileState
+from starhil.emulator.device.stored_images import FileState
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.image_transfer import (
     MAX_BLOCK,
@@ -63,7 +63,7 @@ class FileDownload:
 
     def erase(self, file_type: str, counter: int) -> bool:
         """Erase a file; return False if it does not exist."""
-        return file_type == "bmp" and self._images.erase(counter)
+        return self._images.erase(file_type, counter)
 
     def erase_all(self, *, formatting: bool) -> None:
         """Erase all files, which takes `ERASE_S`."""
@@ -85,13 +85,13 @@ class FileDownload:
     def _file(self, file_type: str, counter: int) -> bytes:
         if file_type == "index":
             return b"".join(
-                INDEX_ENTRY.pack(BMP_TYPE, image.number, image.edge, image.file_size, image.frame)
-                for image in self._images.state.files
+                INDEX_ENTRY.pack(file.type, file.number, file.edge, file.file_size, file.frame)
+                for file in self._images.state.files
             )
-        images = self._images.state
-        chosen = (image for image in images.files if image.number == counter)
-        image = next(chosen, None) if counter else images.stored
-        return image.bmp() if image is not None and file_type == "bmp" else b""
+        newest_first = reversed(self._images.state.files)
+        chosen = (file for file in newest_first if file.kind == file_type and counter in (0, file.number))
+        file = next(chosen, None)
+        return b"" if file is None else file.content()
 
     def burst(self, *, ignore_hole_map: bool) -> list[Reply]:
         """Return the packets of the block, by default only those missing in the hole map."""

@@ -1,6 +1,6 @@
-"""Images for download: capture, storage and transfer.
+"""Images for download: capture, storage, compression and transfer.
 
-Stored images are files; a new one replaces the oldest. A download keeps the image that it has opened.
+Stored images are files, and so are those compressed from them; a new one replaces the oldest. A download keeps the image that it has opened.
 """
 
 from __future__ import annotations
@@ -12,9 +12,15 @@ from typing import Any, Final
 from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.signals import Signals
-from starhil.emulator.device.stored_images import ImageState, StoredImage
-from starhil.emulator.sensor.pipeline.client import PipelineClient, PipelineReply
-from starhil.emulator.sensor.pipeline.messages import IMAGE_EDGES, ImageRequest, ImageResult
+from starhil.emulator.device.stored_images import Conversion, ImageState, JpgFile, StoredFile, StoredImage
+from starhil.emulator.sensor.pipeline.client import PipelineClient, PipelineReply, PipelineRequest
+from starhil.emulator.sensor.pipeline.messages import (
+    IMAGE_EDGES,
+    ImageRequest,
+    ImageResult,
+    JpgRequest,
+    JpgResult,
+)
 from starhil.emulator.simulation.clock import DeviceTime
 from starhil.emulator.simulation.scheduler import Scheduler
 from starhil.protocol.icd.conventions import NANOSECONDS
@@ -22,8 +28,11 @@ from starhil.protocol.icd.conventions import NANOSECONDS
 STORE_S: Final = 0.1
 """Modelled time to store an image, seconds."""
 
+CONVERT_S: Final = 0.5
+"""Modelled time to compress an image, seconds."""
+
 MAX_FILES: Final = 16
-"""Number of images that are kept."""
+"""Number of files that are kept."""
 
 
 class ImageStore:
@@ -49,7 +58,7 @@ class ImageStore:
     def clear(self) -> None:
         """Discard everything, because the device restarts."""
         self._generation += 1
-        self._count = 0
+        self._counts = dict.fromkeys((StoredImage.kind, JpgFile.kind), 0)
         self._at_exposure: Callable[[], None] | None = None
         """Called once, when the next exposure has been sent to the pipeline."""
         self.state = ImageState()
@@ -62,15 +71,18 @@ class ImageStore:
         """Load a chunk of the open image."""
         self._change(chunk_number=number)
 
-    def erase(self, number: int) -> bool:
-        """Erase a stored image; return False if it does not exist."""
-        kept = tuple(image for image in self.state.files if image.number != number)
-        existed = len(kept) < len(self.state.files)
-        self._change(files=kept)
-        return existed
+    def file(self, kind: str, number: int) -> StoredFile | None:
+        """Return a file by its kind and its number within it; None if there is none."""
+        return next((file for file in self.state.files if (file.kind, file.number) == (kind, number)), None)
+
+    def erase(self, kind: str, number: int) -> bool:
+        """Erase a file; return False if it does not exist."""
+        found = self.file(kind, number)
+        self._change(files=tuple(file for file in self.state.files if file is not found))
+        return found is not None
 
     def erase_all(self) -> None:
-        """Erase all stored images."""
+        """Erase all files."""
         self._change(files=())
 
     def save(self, edge: int) -> None:
@@ -89,6 +101,24 @@ class ImageStore:
             self._change(busy=False, percent=100, status="ok")
 
         self._capture(fetch)
+
+    def convert(self, number: int, quality: int) -> None:
+        """Compress a stored image, and store it as a file; `quality` 100 loses least, 1 most."""
+        source = self.file(StoredImage.kind, number)
+        if not isinstance(source, StoredImage):
+            self._change(conversion=Conversion(result="load_error"))
+            return
+        self._change(conversion=Conversion(result="busy"))
+
+        def store(answer: PipelineReply) -> None:
+            if not isinstance(answer, JpgResult):
+                self._change(conversion=Conversion(result="load_error"))
+                return
+            made = self._next_number(JpgFile.kind)
+            self._add(JpgFile(answer.data, source.edge, source.frame, made, self._time.unix_ns()))
+            self._change(conversion=Conversion(100, "success", made))
+
+        self._ask(JpgRequest(source.edge, source.pixels, quality), CONVERT_S, store)
 
     def capture_full(self) -> PendingAnswer[ImageResult | None]:
         """Capture the next exposure in full size without storing it; the result is None on failure."""
@@ -131,11 +161,19 @@ class ImageStore:
             then()
 
     def _store(self, answer: ImageResult) -> None:
-        """Store an image as the newest file; the oldest one is deleted if there are too many."""
-        number = self._count = self._count % 255 + 1
-        self.erase(number)
-        stored = StoredImage(answer.width, answer.pixels, answer.frame, number, self._time.unix_ns())
-        self._change(files=(*self.state.files, stored)[-MAX_FILES:])
+        """Store an image."""
+        number = self._next_number(StoredImage.kind)
+        self._add(StoredImage(answer.width, answer.pixels, answer.frame, number, self._time.unix_ns()))
+
+    def _next_number(self, kind: str) -> int:
+        """Return the number of the next file of a kind, from 1 to 255 and again from 1."""
+        number = self._counts[kind] = self._counts[kind] % 255 + 1
+        return number
+
+    def _add(self, file: StoredFile) -> None:
+        """Store the newest file, in the place of one with its number; delete the oldest if there are too many."""
+        self.erase(file.kind, file.number)
+        self._change(files=(*self.state.files, file)[-MAX_FILES:])
 
     def open_stored(self, edge: int) -> bool:
         """Open the stored image for download, reduced to `edge`; return False if it is too small."""
@@ -160,15 +198,23 @@ class ImageStore:
 
     def _fetch_image(self, edge: int, take: Callable[[ImageResult | None], None]) -> None:
         """Fetch an image from the pipeline; call `take` after `STORE_S` with it, or with None on failure."""
+        self._ask(
+            ImageRequest(edge),
+            STORE_S,
+            lambda answer: take(answer if isinstance(answer, ImageResult) and answer.frame >= 0 else None),
+        )
+
+    def _ask(self, request: PipelineRequest, after_s: float, take: Callable[[PipelineReply], None]) -> None:
+        """Ask the pipeline; call `take` with its answer, not before a time, and never after a restart of the device."""
         generation = self._generation
         answered = PendingAnswer[PipelineReply]()
 
         def finish(answer: PipelineReply) -> None:
             if generation == self._generation:
-                take(answer if isinstance(answer, ImageResult) and answer.frame >= 0 else None)
+                take(answer)
 
-        self._imager.submit(ImageRequest(edge), answered.end)
-        due_ns = self._now_ns() + round(STORE_S * NANOSECONDS)
+        self._imager.submit(request, answered.end)
+        due_ns = self._now_ns() + round(after_s * NANOSECONDS)
         self._scheduler.at(due_ns, lambda _due_ns: answered.when_done(finish))
 
 

@@ -16,7 +16,7 @@ from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.reported import SEQUENCES
 from starhil.emulator.device.snapshot import Snapshot
-from starhil.emulator.device.stored_images import BMP_TYPE, StoredImage, msdos_time
+from starhil.emulator.device.stored_images import StoredFile, msdos_time
 from starhil.emulator.sensor.pipeline.messages import MatchedStar, Triple, as_triple
 from starhil.protocol.icd.conventions import DAY_NS, NANOSECONDS
 from starhil.protocol.icd.device_model import HEALTH, PARAMETER, generic, number_in
@@ -142,7 +142,7 @@ def _selected(name: str, function: Callable[[Snapshot, Parameter], float]) -> No
     _quantity(f"selected.{name}", of_selected)
 
 
-def _file(name: str, function: Callable[[StoredImage], int]) -> None:
+def _file(name: str, function: Callable[[StoredFile], int]) -> None:
     """Bind a number of the current file of the list, which is 0 if there is none."""
 
     def of_file(snapshot: Snapshot) -> int:
@@ -349,6 +349,9 @@ _quantity("image.status", lambda snapshot: snapshot.images.status)
 _quantity("image.chunk", _image_chunk)
 _quantity("image.chunk_number", lambda snapshot: snapshot.images.chunk_number)
 _quantity("image.chunk_checksum", lambda snapshot: frame_checksum(snapshot.images.chunk))
+_quantity("conversion.percent", lambda snapshot: snapshot.images.conversion.percent)
+_quantity("conversion.result", lambda snapshot: snapshot.images.conversion.result)
+_quantity("conversion.counter", lambda snapshot: snapshot.images.conversion.number)
 _quantity("file.ready", lambda snapshot: bool(snapshot.files.block))
 _quantity("file.parameter_error", lambda snapshot: snapshot.files.parameter_error)
 _quantity("file.checksum", lambda snapshot: file_checksum(snapshot.files.block))
@@ -358,12 +361,12 @@ _quantity(
     "file.packet",
     lambda snapshot: parse_burst_packet(burst_packet(snapshot.files.block, snapshot.files.packets[0]))[1],
 )
-_file("type", lambda _image: BMP_TYPE)
+_file("type", lambda file: file.type)
 _quantity("file.updating", lambda snapshot: snapshot.file_updating)
-_file("counter", lambda image: image.number)
-_file("size", lambda image: image.file_size)
-_file("time", lambda image: msdos_time(image.unix_ns))
-_file("crc", lambda image: image.file_crc)
+_file("counter", lambda file: file.number)
+_file("size", lambda file: file.file_size)
+_file("time", lambda file: msdos_time(file.unix_ns))
+_file("crc", lambda file: file.file_crc)
 _quantity("card.formatting", lambda snapshot: snapshot.erasing and snapshot.files.formatting)
 _quantity("card.erasing", lambda snapshot: snapshot.erasing and not snapshot.files.formatting)
 _quantity("file.hole_map[n]", lambda snapshot, number: snapshot.files.arrived.part(number))

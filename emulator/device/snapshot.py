@@ -17,7 +17,7 @@ from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import ParameterState
 from starhil.emulator.device.power import FrameTiming, Phase, PowerModel, ThermalState
 from starhil.emulator.device.reported import Reported, reported
-from starhil.emulator.device.stored_images import FileState, ImageState, StoredImage
+from starhil.emulator.device.stored_images import FileState, ImageState, StoredFile
 from starhil.emulator.profile.sections import DeviceConfig
 from starhil.emulator.sensor.pipeline.messages import MatchedStar, Quaternion
 from starhil.protocol.icd.codec import Field
@@ -125,8 +125,8 @@ class Snapshot:
         return self.now_ns < self.files.looked_up_ns
 
     @once
-    def file(self) -> StoredImage | None:
-        """The image whose file is current in the list; None until it has been looked up, and at the end of the list."""
+    def file(self) -> StoredFile | None:
+        """The current file of the list; None until it has been looked up, and at the end of the list."""
         files, position = self.images.files, self.files.position
         return None if self.file_updating or position >= len(files) else files[position]
 

@@ -6,7 +6,7 @@ import datetime as dt
 import struct
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final
+from typing import ClassVar, Final, TypeAlias
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from starhil.emulator.sensor.pipeline.binning import mean_over_squares
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.image_transfer import FRAME_SIZE, HoleMap, file_checksum
 
+JPG_TYPE: Final = 3
 BMP_TYPE: Final = 4
 PALETTE: Final = b"".join(bytes((n, n, n, 0)) for n in range(256))
 BMP_HEAD: Final = struct.Struct("<2sIHHIIiiHHIIiiII")
@@ -33,6 +34,11 @@ class StoredImage:
     unix_ns: int = 0
     """Time on the device's clock when it was stored."""
 
+    kind: ClassVar[str] = "bmp"
+    """Kind of the file as named in the interface definition."""
+    type: ClassVar[int] = BMP_TYPE
+    """Number of the kind of the file."""
+
     def binned(self, edge: int) -> StoredImage:
         """Return the image reduced to `edge` by averaging squares of pixels."""
         if edge == self.edge:
@@ -49,9 +55,9 @@ class StoredImage:
     @cached_property
     def file_crc(self) -> int:
         """Checksum of the file."""
-        return file_checksum(self.bmp())
+        return file_checksum(self.content())
 
-    def bmp(self) -> bytes:
+    def content(self) -> bytes:
         """Return the image as a grey BMP file."""
         offset = BMP_HEAD.size + len(PALETTE)
         planes, bits, compression, per_metre, colours = 1, 8, 0, 2835, 256
@@ -61,16 +67,65 @@ class StoredImage:
 
 
 @dataclass(frozen=True)
+class JpgFile:
+    """A stored image that has been compressed."""
+
+    data: bytes
+    edge: int
+    frame: int
+    """Edge in pixels, and number of the exposure."""
+    number: int
+    """Number of the file among those of its kind since start-up, as that of an image."""
+    unix_ns: int
+    """Time on the device's clock when it was stored."""
+
+    kind: ClassVar[str] = "jpg"
+    """Kind of the file as named in the interface definition."""
+    type: ClassVar[int] = JPG_TYPE
+    """Number of the kind of the file."""
+
+    @property
+    def file_size(self) -> int:
+        """Size of the file, bytes."""
+        return len(self.data)
+
+    @cached_property
+    def file_crc(self) -> int:
+        """Checksum of the file."""
+        return file_checksum(self.data)
+
+    def content(self) -> bytes:
+        """Return the file."""
+        return self.data
+
+
+StoredFile: TypeAlias = StoredImage | JpgFile
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """The last conversion of an image to JPG."""
+
+    percent: int = 0
+    result: str = "nothing"
+    """As named in the interface definition."""
+    number: int = 0
+    """Number of the new file; 0 if there is none."""
+
+
+@dataclass(frozen=True)
 class ImageState:
     """Capture, storage and download of images at one moment."""
 
-    files: tuple[StoredImage, ...] = ()
-    """The stored images, oldest first."""
+    files: tuple[StoredFile, ...] = ()
+    """The stored files, oldest first."""
     percent: int = 0
     status: str = "ok"
     """Progress of save_image, and its state as named in the interface definition."""
     busy: bool = False
     """Whether an image is being captured or opened."""
+    conversion: Conversion = Conversion()
+    """Progress and result of convert_image."""
     download: StoredImage | None = None
     """The image that is open for download in chunks."""
     chunk_number: int = 0
@@ -79,7 +134,7 @@ class ImageState:
     @property
     def stored(self) -> StoredImage | None:
         """The newest stored image, or None."""
-        return self.files[-1] if self.files else None
+        return next((file for file in reversed(self.files) if isinstance(file, StoredImage)), None)
 
     @property
     def chunks(self) -> int:

@@ -485,6 +485,7 @@ _WITHOUT_EFFECT: Final = frozenset(
         "nothing",
         "reset",
         "save_image",
+        "convert_image",
         "open_image",
         "load_image_chunk",
         "load_file_block",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
+from starhil.emulator.device.device import Device
 from starhil.emulator.device.snapshot import Snapshot
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from tests.conformance.mutant_seams import (
@@ -34,6 +35,12 @@ def stale_attitude(unit: SimulatedUnit) -> None:
         return bytes(data)
 
     unit.requests.telemetry = changed
+
+
+def _newest(device: Device) -> bytes:
+    """Return the number of the newest image."""
+    stored = device.images.state.stored
+    return bytes((0 if stored is None else stored.number,))
 
 
 def _reversed_tail(replies: list[Reply]) -> list[Reply]:
@@ -148,6 +155,19 @@ enter(
         "advance",
         lambda files, _h: files._go_to((files.state.position + 1) % (len(files._images.state.files) + 1)),
     ),
+)
+enter("an image is not converted", "both", "jpg.converted", only_acknowledged(57))
+enter(
+    "every conversion has the same quality",
+    "both",
+    "jpg.quality",
+    handling(lambda _d, r, h: h(dataclasses.replace(r, data=r.data[:1] + b"\x50\0") if r.id == 57 else r)),
+)
+enter(
+    "the newest image is converted",
+    "both",
+    "jpg.missing",
+    handling(lambda d, r, h: h(dataclasses.replace(r, data=_newest(d) + r.data[1:]) if r.id == 57 else r)),
 )
 enter(
     "the packets of a burst stay at the first",

@@ -19,10 +19,12 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.run.pump import ClockPump
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.pipeline.client import PipelineReply, PipelineRequest
+from starhil.emulator.sensor.pipeline.jpg import compress_image
 from starhil.emulator.sensor.pipeline.messages import (
     FrameResult,
     ImageRequest,
     ImageResult,
+    JpgRequest,
     MatchedStar,
     as_quaternion,
 )
@@ -154,6 +156,8 @@ class TruthImager:
                 (row * 7 + column * 3 + self.last) % 256 for row in range(edge) for column in range(edge)
             )
             return ImageResult(edge, edge, self.last, pixels if self.last >= 0 else b"")
+        if isinstance(request, JpgRequest):
+            return compress_image(request)
         self.last = request.index
         if not request.solve:
             return FrameResult(request.index, solved=False)

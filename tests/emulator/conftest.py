@@ -18,11 +18,13 @@ from starhil.emulator.launch import Emulator, RunOptions
 from starhil.emulator.profile import Profile
 from starhil.emulator.sensor.pipeline import worker_process
 from starhil.emulator.sensor.pipeline.client import PipelineReply, PipelineRequest
+from starhil.emulator.sensor.pipeline.jpg import compress_image
 from starhil.emulator.sensor.pipeline.messages import (
     FrameRequest,
     FrameResult,
     ImageRequest,
     ImageResult,
+    JpgRequest,
     MatchedStar,
     Preview,
 )
@@ -73,6 +75,8 @@ class FakePipeline:
             edge = request.edge or 10
             pixels = bytes(n % 251 for n in range(edge)) * edge
             return ImageResult(edge, edge, self.last_index, pixels if self.last_index >= 0 else b"")
+        if isinstance(request, JpgRequest):
+            return compress_image(request)
         self.last_index = request.index
         if not request.solve:
             return FrameResult(request.index, solved=False)

@@ -51,7 +51,7 @@ def message(control: int, data: bytes = b"") -> bytes:
 def reply(port: int, command: bytes) -> tuple[int, bytes]:
     """Poll; return control field and data of a reply of one message."""
     os.write(port, command)
-    line, end = b"", time.monotonic() + 5.0
+    line, end = b"", time.monotonic() + PATIENCE_S
     while line.count(b"\xc0") < 2 and time.monotonic() < end:
         if select.select([port], [], [], 0.1)[0]:
             line += os.read(port, 4096)

@@ -25,6 +25,7 @@ IMAGES: Final = CaseArea[LinkProbe](
 BURSTS: Final = CaseArea[LinkProbe](
     "bursts", "CubeComputer TC 112, 119 to 127 and TLM 241, 242 (AlbertaSat, CTS, EnduroSat)", intrusive=True
 )
+JPG: Final = CaseArea[LinkProbe]("jpg", "CubeComputer TC 57 and TLM 133 (AlbertaSat, CTS)", intrusive=True)
 FILES: Final = CaseArea[LinkProbe](
     "files", "CubeComputer TC 33, 108, 113, 118 and TLM 234, 243 (AlbertaSat, CTS, EnduroSat)", intrusive=True
 )
@@ -139,6 +140,56 @@ def whole_file(probe: LinkProbe) -> None:
     check_equal(crc_hqx(data, CRC_START), file["crc"], "checksum of the file")
     _pixels, width, height = decode_bmp(data)
     check_equal((width, height), (EDGE, EDGE), "width and height")
+
+
+def _convert(probe: LinkProbe, number: Value, quality: int = 90, result: str = "success") -> dict[str, Value]:
+    """Convert an image; return the status with this result."""
+    probe.command("convert_to_jpg", file_counter=number, quality=quality)
+    return probe.wait_for("jpg_status", {"result": result}, probe.times.image_s)
+
+
+@JPG.case("converted", "an image is converted to a JPG file of its size, which is listed and downloaded")
+def converted(probe: LinkProbe) -> None:
+    _save(probe)
+    image = _files(probe)[-1]
+    status = _convert(probe, image["counter"])
+    check_equal(status["percent"], 100, "percent")
+    *_, listed_image, file = _files(probe)
+    check_equal(listed_image, image, "the image in the list")
+    check_equal((file["type"], file["counter"]), (3, status["file_counter"]), "type, counter")
+    size = int(file["size"])
+    probe.command("load_file_block", file_type="jpg", file_counter=file["counter"], length=BLOCK)
+    seen = probe.wait_for("file_block", {"ready": True}, probe.times.image_s)
+    check_equal((seen["length"], seen["checksum"]), (size, file["crc"]), "length, checksum of the block")
+    data = b"".join(part for _, part in _burst(probe, -(-size // PACKET), everything=True))[:size]
+    check_equal((data[:3], data[-2:]), (b"\xff\xd8\xff", b"\xff\xd9"), "start and end of a JPEG image")
+    frame = data.index(b"\xff\xc0") if b"\xff\xc0" in data else -9
+    edges = (data[frame + 5 : frame + 7], data[frame + 7 : frame + 9])
+    check_equal(edges, 2 * (EDGE.to_bytes(2, "big"),), "height and width")
+
+
+@JPG.case("quality", "less quality makes a smaller file; none outside 1 to 100 is accepted")
+def quality(probe: LinkProbe) -> None:
+    _save(probe)
+    number = _files(probe)[-1]["counter"]
+    sizes = []
+    for percent in (100, 1):
+        _convert(probe, number, percent)
+        sizes.append(int(_files(probe)[-1]["size"]))
+    check(sizes[1] < sizes[0], "a smaller file", sizes)
+    for percent in (0, 101):
+        probe.expect_refused("convert_to_jpg", INVALID_PARAMETER, file_counter=number, quality=percent)
+
+
+@JPG.case("missing", "the conversion of an image that does not exist ends with a load error")
+def missing(probe: LinkProbe) -> None:
+    for _ in range(2):
+        _save(probe)
+    number = _files(probe)[-2]["counter"]
+    probe.command("erase_file", file_type="bmp", file_counter=number)
+    before = _files(probe)
+    _convert(probe, number, result="load_error")
+    check_equal(_files(probe), before, "list of files")
 
 
 @BURSTS.case("one-by-one", "the packets of a burst can be read one by one, and the last one stays")

@@ -62,23 +62,39 @@ def command(control: int, data: bytes = b"") -> bytes:
     return line(body + crc(body))
 
 
+def bodies(raw: bytes) -> list[bytes]:
+    """Return what stands between FEND bytes."""
+    return [
+        piece.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
+        for piece in raw.split(b"\xc0")
+        if piece
+    ]
+
+
 def received(probe: SerialProbe, sent: bytes) -> Sequence[Message]:
-    """Send bytes; return all messages of the reply, whose addresses and CRC must be right."""
+    """Send bytes; return all messages of the reply, whose addresses and CRC must be right.
+
+    A reply to a poll ends with a final message; bytes may come late, as on a busy machine.
+    """
     probe.drain()
     probe.send(sent)
-    quiet_s, before = probe.times.quiet_s, -1
-    end = probe.now() + (probe.times.answer_s if sent[3:4] > b"\x7f" else quiet_s)
-    while probe.now() < end and not (before == len(probe.raw) > 0):
-        before = len(probe.raw)
-        probe.sleep(quiet_s)
-    found, raw = [], probe.raw
-    for piece in filter(None, raw.split(b"\xc0")):
-        body = piece.replace(b"\xdb\xdc", b"\xc0").replace(b"\xdb\xdd", b"\xdb")
+    polled, size, since = sent[3:4] > b"\x7f", 0, probe.now()
+    while True:
+        probe.sleep(probe.times.quiet_s)
+        if len(probe.raw) > size:
+            size, since = len(probe.raw), probe.now()
+            continue
+        found = bodies(bytes(probe.raw))
+        ended = bool(found) and probe.raw.endswith(b"\xc0") and bool(found[-1][2:3] > b"\x7f")
+        if ended or not polled or probe.now() - since > probe.times.answer_s:
+            break
+    messages = []
+    for body in found:
         check(body[:2] == bytes((OBC, TRACKER)), f"addresses {OBC:02X} {TRACKER:02X}", body[:2].hex(" "))
         check(crc(body[:-2]) == body[-2:], f"CRC {crc(body[:-2]).hex(' ')}", body[-2:].hex(" "))
-        found.append(Message(body[2], body[3:-2]))
+        messages.append(Message(body[2], body[3:-2]))
     probe.drain()
-    return found
+    return messages
 
 
 def reply(probe: SerialProbe, code: int, data: bytes = b"") -> bytes:

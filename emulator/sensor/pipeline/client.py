@@ -24,6 +24,8 @@ from starhil.emulator.sensor.pipeline.messages import (
     ImageResult,
     IndexReady,
     IndexRequest,
+    JpgRequest,
+    JpgResult,
     PipelineEnded,
     PipelineReady,
     PipelineSetup,
@@ -35,8 +37,8 @@ from starhil.emulator.simulation.signal import Signal
 
 log = logging.getLogger("starhil.pipeline")
 
-PipelineRequest: TypeAlias = FrameRequest | ImageRequest
-PipelineReply: TypeAlias = FrameResult | ImageResult | IndexReady | Failure
+PipelineRequest: TypeAlias = FrameRequest | ImageRequest | JpgRequest
+PipelineReply: TypeAlias = FrameResult | ImageResult | JpgResult | IndexReady | Failure
 ReplyCallback: TypeAlias = Callable[[PipelineReply], None]
 
 

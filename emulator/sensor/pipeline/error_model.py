@@ -19,12 +19,14 @@ import random
 from typing import Any, Final
 
 from starhil.emulator.sensor.pipeline.client import PipelineRequest, ReplyCallback
+from starhil.emulator.sensor.pipeline.jpg import compress_image
 from starhil.emulator.sensor.pipeline.messages import (
     FrameRequest,
     FrameResult,
     ImageRequest,
     ImageResult,
     IndexRequest,
+    JpgRequest,
     MatchedStar,
     PipelineEnded,
     PipelineReady,
@@ -105,6 +107,8 @@ class ErrorModel:
             done(PipelineEnded("error model: not running"))
         elif isinstance(request, ImageRequest):
             done(self._image(request.edge))
+        elif isinstance(request, JpgRequest):
+            done(compress_image(request))
         else:
             self._last_image = request.index
             done(self._solve(request) if request.solve else FrameResult(request.index, solved=False))

@@ -273,6 +273,22 @@ class ImageResult:
 
 
 @dataclass(frozen=True)
+class JpgRequest:
+    """Request to compress a square 8-bit image of `edge` pixels as JPEG; `quality` 100 loses least, 1 most."""
+
+    edge: int
+    pixels: bytes
+    quality: int
+
+
+@dataclass(frozen=True)
+class JpgResult:
+    """A JPEG file."""
+
+    data: bytes
+
+
+@dataclass(frozen=True)
 class PipelineReady:
     """Message that the pipeline is ready."""
 

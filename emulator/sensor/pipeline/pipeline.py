@@ -20,6 +20,7 @@ from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.pipeline.binning import mean_over_squares
 from starhil.emulator.sensor.pipeline.bodies import bodies_in_field, near_any, stars_seen, with_bodies
 from starhil.emulator.sensor.pipeline.image_source import ImageSource, open_images, used_bits
+from starhil.emulator.sensor.pipeline.jpg import compress_image
 from starhil.emulator.sensor.pipeline.messages import (
     Failure,
     FrameRequest,
@@ -28,6 +29,8 @@ from starhil.emulator.sensor.pipeline.messages import (
     ImageResult,
     IndexReady,
     IndexRequest,
+    JpgRequest,
+    JpgResult,
     MatchedStar,
     PipelineReady,
     PipelineSetup,
@@ -163,8 +166,8 @@ class Pipeline:
         gc.enable()
 
     def handle(
-        self, request: FrameRequest | ImageRequest | IndexRequest
-    ) -> FrameResult | ImageResult | IndexReady | Failure:
+        self, request: FrameRequest | ImageRequest | JpgRequest | IndexRequest
+    ) -> FrameResult | ImageResult | JpgResult | IndexReady | Failure:
         """Process a request; return a failure if the settings make it impossible."""
         try:
             if isinstance(request, IndexRequest):
@@ -174,6 +177,8 @@ class Pipeline:
                 return IndexReady()
             if isinstance(request, ImageRequest):
                 return self._scaled_image(request)
+            if isinstance(request, JpgRequest):
+                return compress_image(request)
             return self._process_frame(request)
         except (EmulatorError, StaridError) as error:
             return Failure(str(error))

@@ -12,6 +12,7 @@ import typer
 from typer.testing import CliRunner
 
 from starhil.emulator.cli import app
+from starhil.emulator.cli.run import DeviceOptions
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.workers import NEVER_READY
 
@@ -172,3 +173,7 @@ def test_help_shows_flags_without_a_type_and_positional_arguments_in_capitals() 
         text = CliRunner().invoke(app.build_app(), [command, "--help"]).stdout
         assert "<bool>" not in text
         assert shown in text.split("Usage:")[1].splitlines()[0]
+
+
+def test_the_unit_of_the_command_line_replaces_that_of_the_profile():
+    assert DeviceOptions(unit="sagitta").profile("ideal", 1).unit == "sagitta"

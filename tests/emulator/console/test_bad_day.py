@@ -23,8 +23,8 @@ from tests.emulator.console.browser import (
 
 pytestmark = MARKS
 
-SLOW_BYTES_S = 20_000
-"""Rate of a slow link: a fifth of what images at 3 Hz need."""
+SLOW_BYTES_S = 6_000
+"""Rate of a slow link: a tenth of what images at 3 Hz need."""
 
 TABS = ("telemetry", "telecommands", "wire", "events", "faults", "truth")
 WIDTHS = (390, 820, 1280, 1920, 3840)
@@ -75,7 +75,9 @@ def test_over_a_slow_link_nothing_queues_images_are_left_out_and_numbers_are_not
         slow.wait_for_function("() => starhil.store.images.length > 2")
         link.bytes_s, link.most = SLOW_BYTES_S, 0
         begin = slow.evaluate("starhil.store.now")
-        slow.wait_for_function("begin => starhil.store.now > begin + 8", arg=begin)
+        slow.wait_for_function(
+            "begin => starhil.store.now > begin + 8 && starhil.store.images.at(-1).time > begin", arg=begin
+        )
         numbers = slow.evaluate(
             """begin => {
                 const { rows } = starhil.store;

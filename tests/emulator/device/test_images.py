@@ -279,7 +279,7 @@ def test_the_oldest_file_gives_way_and_numbers_begin_again_at_1(bench):
     for _ in range(17):
         save(bench)
     assert counters(bench) == list(range(2, 18))
-    bench.device.images._count = 254
+    bench.device.images._counts["bmp"] = 254
     for _ in range(2):
         save(bench)
     assert counters(bench)[-2:] == [255, 1]
@@ -291,7 +291,7 @@ def test_the_file_list_has_size_checksum_and_time(bench):
     bench.command("reset_file_list")
     bench.step(0.03)
     info = bench.read("file_info")
-    file = bench.device.images.state.stored.bmp()
+    file = bench.device.images.state.stored.content()
     assert (info["type"], info["counter"], info["size"]) == (4, 1, len(file))
     assert info["crc"] == binascii.crc_hqx(file, 0)
     date = info["time"] >> 16
@@ -302,6 +302,59 @@ def test_the_file_list_has_size_checksum_and_time(bench):
         )
         <= 4
     )
+
+
+def test_an_image_is_converted_to_a_jpg_file(bench):
+    save(bench, "size_256")
+    nothing = {"percent": 0, "result": "nothing", "file_counter": 0}
+    assert bench.read("jpg_status") == nothing
+    assert bench.command("convert_to_jpg", file_counter=1, quality=100) is ErrorCode.OK
+    assert bench.read("jpg_status") == nothing | {"result": "busy"}
+    assert bench.command("convert_to_jpg", file_counter=1) is ErrorCode.BUSY
+    bench.step(0.6)
+    assert bench.read("jpg_status") == {"percent": 100, "result": "success", "file_counter": 1}
+    for counter in (1, 0):  # 0: the newest
+        assert load(bench, "jpg", 0, 20480, counter) is ErrorCode.OK
+    block = bench.read("file_block")
+    file = bench.device.images.file("jpg", 1).content()
+    assert (block["length"], block["checksum"]) == (len(file), binascii.crc_hqx(file, 0))
+    image = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert image.shape == (256, 256)
+    assert np.abs(image.astype(int) - np.arange(256) % 251).max() <= 12  # the edge from 250 to 0 rings
+
+
+def test_files_of_both_kinds_have_numbers_of_their_own(bench):
+    for _ in range(2):
+        save(bench)
+    bench.command("convert_to_jpg", file_counter=2)
+    bench.step(0.6)
+    assert counters(bench) == [1, 2, 1]
+    assert bench.command("erase_file", file_type="bmp", file_counter=1) is ErrorCode.OK
+    assert counters(bench) == [2, 1]
+    assert bench.command("erase_file", file_type="jpg", file_counter=1) is ErrorCode.OK
+    assert counters(bench) == [2]
+    assert bench.command("erase_file", file_type="jpg", file_counter=2) is ErrorCode.INVALID_PARAMETER
+
+
+def test_a_conversion_that_fails_is_a_load_error(bench, monkeypatch):
+    failed = {"percent": 0, "result": "load_error", "file_counter": 0}
+    assert bench.command("convert_to_jpg", file_counter=7) is ErrorCode.OK
+    assert bench.read("jpg_status") == failed
+    save(bench)
+    monkeypatch.setattr(bench.imager, "submit", lambda _request, done: done(Failure("x")), raising=False)
+    assert bench.command("convert_to_jpg", file_counter=1) is ErrorCode.OK
+    bench.step(0.6)
+    assert bench.read("jpg_status") == failed
+    assert counters(bench) == [1]
+
+
+def test_a_reset_ends_a_conversion(bench):
+    save(bench)
+    bench.command("convert_to_jpg", file_counter=1)
+    bench.command("reset")
+    bench.step(3.0)
+    assert bench.read("jpg_status")["result"] == "nothing"
+    assert counters(bench) == []
 
 
 @pytest.mark.parametrize(
@@ -334,7 +387,7 @@ def test_packets_of_a_burst_are_read_one_by_one(bench):
     assert bench.read("file_packet")["number"] == 0
     bench.send("start_burst", ignore_hole_map=True)
     bench.read("file_block")
-    file = bench.device.images.state.stored.bmp()
+    file = bench.device.images.state.stored.content()
     for number in (0, 1, 2, 2):
         assert bench.read("file_packet") == {"number": number, "data": file[20 * number : 20 * number + 20]}
     bench.command("set_hole_map_1", map=bytes((0b101,)) + bytes(15))

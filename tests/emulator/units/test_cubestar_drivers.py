@@ -1,7 +1,7 @@
 """What published OBC software does with the files of a CubeComputer, from its bytes: list, erase, capture, download, reset.
 
 Each driver is written from its wire facts, with its own framing, time-outs and assumptions, and shares no code with the product.
-What AlbertaSat's own code sent and took is also recorded, in `albertasat_files.txt`:
+What AlbertaSat's own code sent and took is in `test_recorded`.
 
 AlbertaSat
     ex2_hal/adcs in AlbertaSat/ex2_obc_software: UART, replies with ID. It waits for no reply to telecommands 1, 101 and 119.
@@ -18,7 +18,6 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -27,7 +26,7 @@ import pytest
 from tests.emulator.units.clients import Emulated, with_unit
 
 STAR, SIZE_64, SIZE_128, SIZE_256 = 2, 4, 3, 2
-BMP, INDEX = 4, 15
+JPG, BMP, INDEX = 3, 4, 15
 BLOCK = 20480
 NEVER = 2000
 """More polls than any driver needs."""
@@ -416,38 +415,6 @@ def test_albertasat_captures_lists_downloads_and_erases_images():
     run(scenario)
 
 
-RECORDED = Path(__file__).with_name("albertasat_files.txt")
-STEP_S = 0.005
-"""Time after each request of the record."""
-
-
-def recorded() -> list[tuple[bool, bytes, bytes]]:
-    """Whether it was repeated until answered like this, request, and answer, of all exchanges of the record."""
-    exchanges: list[tuple[bool, bytes, bytes]] = []
-    for line in RECORDED.read_text(encoding="ascii").splitlines():
-        mark, _, digits = line.partition(" ")
-        if mark in (">", ">>"):
-            exchanges.append((mark == ">>", bytes.fromhex(digits), b""))
-        elif mark == "<":
-            polled, request, answer = exchanges[-1]
-            exchanges[-1] = (polled, request, answer + bytes.fromhex(digits))
-    return exchanges
-
-
-def test_what_albertasat_s_code_sent_is_answered_with_the_bytes_that_it_took():
-    def scenario(unit: Emulated) -> None:
-        for number, (polled, request, wanted) in enumerate(recorded(), 1):
-            for _ in range(100 if polled else 1):
-                answer = unit.ask(request)
-                answer += b"".join(unit.step(STEP_S))
-                if answer == wanted:
-                    break
-            assert answer == wanted, f"exchange {number}"
-
-    assert len(recorded()) == 43
-    run(scenario)
-
-
 def test_albertasat_expects_silence_after_a_reset_and_after_starting_a_program():
     def scenario(unit: Emulated) -> None:
         obc = AlbertaSat(unit)
@@ -512,6 +479,33 @@ def test_cts_reads_a_file_packet_by_packet():
         assert obc.telecommand(108, bytes((BMP, info.counter, 0))) == 0
         assert obc.telecommand(33, b"\x5a") == 0
         assert obc.file_list() == []
+
+    run(scenario)
+
+
+def test_cts_converts_an_image_and_downloads_the_jpg_file():
+    """`TCMDEXEC_adcs_convert_to_jpg_by_index`: polls row 133 every 50 ms while the result is 0 or 3, at most 255 times."""
+
+    def scenario(unit: Emulated) -> None:
+        obc = Cts(unit)
+        assert obc.telecommand(80, bytes((STAR, SIZE_128))) == 0
+        unit.step(2.0)
+        (image,) = obc.file_list()
+        assert image.type == BMP
+        assert obc.telecommand(57, bytes((image.counter, 95, 0))) == 0
+        for _ in range(255):
+            percent, result, counter = obc.telemetry(133, 3)
+            if result not in (0, 3):
+                break
+            unit.step(0.05)
+        assert (percent, result) == (100, 1)
+        (jpg,) = (info for info in obc.file_list() if (info.type, info.counter) == (JPG, counter))
+        file = obc.download(jpg)
+        assert crc16(file) == jpg.crc
+        assert image_of(file).shape == (128, 128)
+        assert obc.telecommand(57, bytes((99, 95, 0))) == 0
+        assert obc.telemetry(133, 3)[1] == 2
+        assert obc.telecommand(57, bytes((image.counter, 0, 0))) == 3
 
     run(scenario)
 

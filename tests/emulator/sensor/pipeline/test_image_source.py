@@ -18,6 +18,7 @@ from starhil.emulator.sensor.pipeline.messages import (
     Failure,
     FrameRequest,
     ImageRequest,
+    JpgRequest,
     SolverSettings,
     camera_constants,
 )
@@ -86,6 +87,12 @@ def test_the_device_answers_with_the_attitudes_of_the_photographs_in_turn(profil
     assert (download.width, download.height) == (CAMERA.width, CAMERA.height)
     shift = used_bits(photographs[0]) - 8
     assert download.pixels == (photographs[0] >> shift).astype(np.uint8).tobytes()
+    pixels = pipeline.handle(ImageRequest(64)).pixels
+    jpg = pipeline.handle(JpgRequest(64, pixels, 100)).data
+    again = cv2.imdecode(np.frombuffer(jpg, np.uint8), cv2.IMREAD_UNCHANGED)
+    assert (
+        np.abs(again.astype(int).ravel() - np.frombuffer(pixels, np.uint8)).max() <= 2
+    )  # rounding, at quality 100
 
 
 def test_without_repeat_the_images_are_used_up(profile):
