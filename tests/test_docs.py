@@ -138,7 +138,7 @@ def sensor_values(name: str) -> dict[str, object]:
     sections: dict[str, dict[str, object]] = {
         "camera": {
             **profile.camera.model_dump(exclude_none=True),
-            "focal_px": Camera.from_dict(profile.camera.values()).focal_px[0],
+            "focal_px": Camera.from_dict(profile.camera_values).focal_px[0],
         },
         "sensor": dataclasses.asdict(SensorModel(**profile.sensor)),
         "timing": profile.timing.model_dump(),

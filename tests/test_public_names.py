@@ -47,9 +47,8 @@ def test_a_checkout_without_symbolic_links_says_so(tmp_path):
     (folder / "__init__.py").write_text(Path(starhil.__file__).read_text(encoding="utf-8"), encoding="utf-8")
     (folder / "emulator").write_text("../emulator")
     command = [sys.executable, "-c", "import starhil"]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(tmp_path)}
-    )
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path, env=environment)
     assert done.stderr.splitlines()[-1].startswith(
         "ImportError: starhil: this checkout was unpacked without its symbolic links"
     )

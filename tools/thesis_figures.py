@@ -20,6 +20,8 @@ from starid.attitude import Attitude
 CONDITIONS: Final = ("clean", "noise1", "noise2", "noise3", "false", "noise", "both")
 IDENTIFIED_DEG: Final = 0.3
 """Error of the boresight that the thesis counts as identified."""
+TAU: Final = 0.5
+"""The threshold τ of profile `thesis`, the smaller one of the thesis."""
 
 
 def read(path: Path) -> list[dict[str, str]]:
@@ -72,6 +74,7 @@ def figures(samples: list[dict[str, str]], truth: dict[str, dict[str, str]]) -> 
         "motion: translation, median error, °": np.median(np.abs(shifts)) if shifts else np.nan,
         "whole database searched after the region, %": 100.0
         * np.mean([int(sent["triggered"]) for _, sent in images]),
+        f"ε_ψ > {TAU:g}, %": 100.0 * np.mean([float(sent["error_psi"]) > TAU for _, sent in images]),
         "time of identification, median, ms": np.median([float(row["identify_ms"]) for row, _ in images]),
     }
 

@@ -2,11 +2,13 @@
 
 Each condition renders and detects once, and each algorithm gets the same detections. Its device is that of the profile,
 with its parameters, calibration and validation. Lost in space, every image has a random attitude. In sequences, the body
-turns; an algorithm is given the prediction that follows from its own last two attitudes, as in the device.
+turns; an algorithm is given the prediction that follows from its own last two attitudes, as in the device. The images of a
+sequence are alike, so that standard errors of shares are those of independent sequences.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,8 +20,10 @@ from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
 from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.pipeline.messages import FrameRequest
 from starhil.emulator.truth.source import TruthState
+from starid.arrays import Indices, Mask
 from starid.attitude import Attitude, propagate, random_attitude, rate_between
 from starid.identification.solution import Solution
+from starid.identification.thesis.ablations import Part, without
 from starid.imaging.detection import Detections
 
 WRONG_DEG: Final = 0.1
@@ -54,6 +58,17 @@ class Scene:
     missing_stars: int = 0
     predicted: bool = True
     """Whether the algorithms are given a prediction while the body turns; otherwise, each image is lost in space."""
+    false_per_star: int = 0
+    """Number of false stars for each detection of a star."""
+    second: bool = False
+    """Sequences of two images, of which only the second counts."""
+
+    @property
+    def length(self) -> int:
+        """Number of images in a sequence."""
+        if self.second:
+            return 2
+        return 1 if self.rate_deg_s == 0.0 else SEQUENCE
 
     @property
     def name(self) -> str:
@@ -61,12 +76,18 @@ class Scene:
         motion = "lost in space" if self.rate_deg_s == 0.0 else f"{self.rate_deg_s:g} deg/s"
         if not self.predicted:
             motion += " without predictions"
+        if self.second:
+            motion += ", second image"
+        if self.false_per_star:
+            return f"{motion}, {self.false_per_star} false for each star"
         return f"{motion}, {self.false_stars} false, {self.missing_stars} missing"
 
 
 SCENES: Final = (
     *(Scene(rate, *stars) for rate in (0.0, 0.3) for stars in ((0, 0), (5, 0), (30, 0), (0, 5))),
+    Scene(2.0),
     Scene(0.3, 6, predicted=False),
+    Scene(0.3, false_per_star=6, predicted=False, second=True),
 )
 
 
@@ -78,6 +99,8 @@ class AlgorithmPlan:
     frames: int
     seed: int
     overrides: tuple[str, ...] = ()
+    without: Part | None = None
+    """Part of the thesis's algorithms that is taken away."""
 
 
 class Comparison:
@@ -87,7 +110,8 @@ class Comparison:
         self.plan = plan
         own = load_profile(plan.profile, plan.overrides)
         # a profile with options of the thesis's algorithms has none for the geometric one
-        skipped = "geometric" if own.run.algorithm != "geometric" and own.identifier else None
+        apart = own.run.algorithm != "geometric" and own.identifier
+        skipped = "geometric" if apart or plan.without else None
         self.devices = {
             name: EcssDevice(EcssPlan(plan.profile, (*plan.overrides, *settings), plan.seed))
             for name, settings in ALGORITHMS.items()
@@ -96,10 +120,10 @@ class Comparison:
 
     def rows(self, scene: Scene) -> Iterator[dict[str, Any]]:
         """One row per algorithm: shares, errors, times and memory under a condition."""
-        tallies = {name: _Tally(device) for name, device in self.devices.items()}
-        for number, (request, found, restarted) in enumerate(self._images(scene)):
+        tallies = {name: _Tally(device, scene, self.plan.without) for name, device in self.devices.items()}
+        for image in self._images(scene):
             for tally in tallies.values():
-                tally.add(request, found, number, restarted=restarted, predicted=scene.predicted)
+                tally.add(image)
         for name, tally in tallies.items():
             yield {
                 "profile": self.plan.profile,
@@ -108,44 +132,59 @@ class Comparison:
                 **tally.figures(name),
             }
 
-    def _images(self, scene: Scene) -> Iterator[tuple[FrameRequest, Detections, bool]]:
-        """Requests without a prediction, their detections, and whether a new sequence starts."""
+    def _images(self, scene: Scene) -> Iterator[_Image]:
         device = next(iter(self.devices.values()))
-        length = 1 if scene.rate_deg_s == 0.0 else SEQUENCE
         attitude, rate = Attitude.identity(), np.zeros(3)
-        for number in range(self.plan.frames):
+        for number in range(self.plan.frames * (2 if scene.second else 1)):
             rng = np.random.default_rng(
-                (self.plan.seed, number, scene.false_stars, scene.missing_stars, length)
+                (self.plan.seed, number, scene.false_stars, scene.missing_stars, scene.length)
             )
-            if number % length == 0:
+            if number % scene.length == 0:
                 attitude, axis = random_attitude(rng), rng.normal(size=3)
                 rate = np.radians(scene.rate_deg_s) * axis / np.linalg.norm(axis)
             else:
                 attitude = propagate(attitude, rate, PERIOD_S)
-            faintest = device.settings.limiting_magnitude
-            sky: dict[str, Any] = {}
-            if scene.false_stars:
-                sky = {"false_stars": scene.false_stars, "false_star_magnitudes": [1.0, faintest]}
             request = FrameRequest(
                 index=number,
                 truth=TruthState(attitude, rate),
                 exposure_s=device.exposure_s,
                 gain=device.gain,
                 settings=device.settings,
-                faults=sky,
                 temperature_c=device.mean_c,
             )
-            found = device.pipeline.detections(request)
-            yield request, _without(found, scene.missing_stars, rng), number % length == 0
+            count = scene.false_stars
+            if scene.false_per_star:
+                count = scene.false_per_star * len(device.pipeline.detections(request)[0])
+            if count:
+                faintest = device.settings.limiting_magnitude
+                sky = {"false_stars": count, "false_star_magnitudes": [1.0, faintest]}
+                request = replace(request, faults=sky)
+            found, false = device.pipeline.detections(request)
+            kept = _kept(found, scene.missing_stars, rng)
+            yield _Image(number, request, _rows(found, kept), false[kept])
 
 
-def _without(detections: Detections, missing: int, rng: np.random.Generator) -> Detections:
-    """The detections without some of the 25 brightest."""
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """An image of a scene: its request without a prediction, its detections, and which of them are false stars."""
+
+    number: int
+    request: FrameRequest
+    found: Detections
+    false: Mask
+
+
+def _kept(detections: Detections, missing: int, rng: np.random.Generator) -> Indices:
+    """Rows of the detections without some of the 25 brightest."""
     brightest = np.argsort(-detections.flux)[:25]
     lost = rng.choice(brightest, size=min(missing, brightest.size), replace=False)
-    kept = np.delete(np.arange(detections.flux.size), lost)
+    return np.delete(np.arange(detections.flux.size), lost)
+
+
+def _rows(detections: Detections, rows: Indices) -> Detections:
+    """Some of the detections."""
     columns: dict[str, Any] = {
-        name: value[kept]
+        name: value[rows]
         for name, value in vars(detections).items()
         if isinstance(value, np.ndarray) and value.shape[:1] == detections.flux.shape
     }
@@ -155,35 +194,50 @@ def _without(detections: Detections, missing: int, rng: np.random.Generator) -> 
 class _Tally:
     """One algorithm under one condition."""
 
-    def __init__(self, device: EcssDevice) -> None:
+    def __init__(self, device: EcssDevice, scene: Scene, part: Part | None) -> None:
         self._device = device
+        self._scene = scene
+        self._part = part
         self._last: list[tuple[int, Attitude]] = []
+        self._valid: list[bool] = []
         self._errors: list[np.ndarray] = []
         self._normalised: list[np.ndarray] = []
+        self._stated: list[float] = []
         self._ms: list[float] = []
-        self._frames = self._triggers = 0
+        self._in_region = self._triggers = 0
+        self._kept = np.zeros((2, 2), dtype=np.int64)
+        """Detections by whether they are false stars, and whether the filter kept them."""
         self._bytes = 0
 
-    def add(
-        self, request: FrameRequest, detections: Detections, number: int, *, restarted: bool, predicted: bool
-    ) -> None:
+    def add(self, image: _Image) -> None:
         """Identify the detections of an image."""
-        pipeline = self._device.pipeline
-        identifier: Any = pipeline.identifier(request)
+        pipeline, place = self._device.pipeline, image.number % self._scene.length
+        identifier: Any = pipeline.identifier(image.request)
         self._bytes = int(identifier.database_bytes)
-        if restarted:
+        if place == 0:
             self._last = []
             if hasattr(identifier, "reset"):
                 identifier.reset()
-        expected = self._predicted(number) if predicted else None
-        begin = time.thread_time()
-        solution = pipeline.solution(detections, replace(request, predicted=expected))
-        self._ms.append(1e3 * (time.thread_time() - begin))
-        self._frames += 1
-        self._triggers += bool(solution.features is not None and solution.features.triggered)
+        expected = self._predicted(image.number) if self._scene.predicted else None
+        request = replace(image.request, predicted=expected)
+        with without(self._part):
+            begin = time.thread_time()
+            solution = pipeline.solution(image.found, request)
+            elapsed_ms = 1e3 * (time.thread_time() - begin)
         if solution.valid:
-            self._judge(solution, request.truth.attitude)
-            self._last = [*self._last[-1:], (number, solution.attitude)]
+            self._last = [*self._last[-1:], (image.number, solution.attitude)]
+        if self._scene.second and place == 0:
+            return
+        self._ms.append(elapsed_ms)
+        self._valid.append(solution.valid)
+        if solution.valid:
+            self._judge(solution, image.request.truth.attitude)
+        if solution.features is not None:
+            self._in_region += solution.valid and solution.features.search == "rsi"
+            self._triggers += solution.features.triggered
+            kept = np.ones(image.false.size, dtype=np.int64)
+            kept[list(solution.features.removed_index)] = 0
+            np.add.at(self._kept, (image.false.astype(np.int64), kept), 1)
 
     def _predicted(self, number: int) -> Attitude | None:
         """The attitude propagated from the last two, as in the device."""
@@ -198,23 +252,37 @@ class _Tally:
         vector = error.rotation_vector_rad
         self._errors.append(np.array([error.cross_boresight_arcsec, error.roll_arcsec]) / 3600.0)
         self._normalised.append(vector**2 / np.diag(solution.covariance))
+        self._stated.append(solution.cross_boresight_sigma_arcsec / 3600.0)
+
+    def _standard_error(self) -> float | None:
+        """Standard error of the share of valid attitudes, from independent sequences; None if there is only one."""
+        length = 1 if self._scene.second else self._scene.length
+        shares = [np.mean(self._valid[at : at + length]) for at in range(0, len(self._valid), length)]
+        return float(np.std(shares, ddof=1) / math.sqrt(len(shares))) if len(shares) > 1 else None
 
     def figures(self, name: str) -> dict[str, Any]:
         """Figures of the condition: errors of valid attitudes in degrees, times of the processor."""
         errors = np.array(self._errors).reshape(-1, 2)
         limit = FEATURES_WRONG_DEG if name == "thesis" else WRONG_DEG
         across = errors[:, 0] if name == "thesis" else errors.max(axis=1, initial=0.0)
-        valid = len(errors)
+        valid, frames = len(errors), len(self._valid)
+        true, false = self._kept
+        standard_error = self._standard_error()
         return {
-            "frames": self._frames,
+            "frames": frames,
             "valid": valid,
-            "valid_pct": 100.0 * valid / self._frames,
+            "valid_pct": 100.0 * valid / frames,
+            "standard_error_pct": None if standard_error is None else 100.0 * standard_error,
             "wrong": int(np.count_nonzero(across > limit)),
             "within_pct": 100.0 * float(np.mean(errors[:, 0] <= NEAR_DEG)) if valid else None,
             "across_deg": float(np.median(errors[:, 0])) if valid else None,
             "about_deg": float(np.median(errors[:, 1])) if valid else None,
+            "stated_deg": float(np.median(self._stated)) if valid else None,
             "normalised_squared_error": float(np.mean(self._normalised)) if valid else None,
+            "in_region": self._in_region,
             "triggers": self._triggers,
+            "true_kept_pct": 100.0 * true[1] / true.sum() if true.sum() else None,
+            "false_kept_pct": 100.0 * false[1] / false.sum() if false.sum() else None,
             "median_ms": float(np.median(self._ms)),
             "p99_ms": float(np.percentile(self._ms, 99)),
             "kilobytes": self._bytes / 1000.0,

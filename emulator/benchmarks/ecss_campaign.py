@@ -26,6 +26,8 @@ from starhil.emulator.device.surroundings import orbit_of
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
 from starhil.emulator.profile.pipeline_setup import pipeline_setup
+from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sensor.pipeline.error_model import few_stars
 from starhil.emulator.sensor.pipeline.messages import (
     FrameRequest,
     FrameResult,
@@ -36,6 +38,7 @@ from starhil.emulator.sensor.pipeline.pipeline import Pipeline
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.unit import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
+from starid.camera import Camera
 from starid.storage.results import Results
 
 RATES_DEG_S: Final = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
@@ -103,6 +106,14 @@ class EcssPlan:
             for value in values
         ]
         return [static, thermal, dated, rest, *varied]
+
+    def warning(self) -> str:
+        """Return a warning if the camera sees too few stars, or an empty text."""
+        profile = load_profile(self.profile, self.overrides)
+        icd = load_unit(profile.unit_source)
+        parameters = Parameters(icd, profile_defaults(profile, icd))
+        camera = Camera.from_dict(profile.camera_values).to_dict()
+        return few_stars(camera, SensorModel().with_(**profile.sensor), parameters)
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,23 +341,27 @@ def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
 
 
 def run_ecss(
-    plan: EcssPlan, *, folder: Path | None = None, jobs: int = 1
+    plan: EcssPlan, *, folder: Path | None = None, jobs: int = 1, only: str = ""
 ) -> Iterator[tuple[str, int, Results]]:
-    """Run a campaign, as `run_campaign`; yield condition name, chunk number and results of each part as it finishes."""
+    """Run a campaign, or one of its conditions, as `run_campaign`.
+
+    Yields condition name, chunk number and results of each part as it finishes.
+    """
     profile = load_profile(plan.profile, plan.overrides)
     described = {**asdict(plan), "device": profile.model_dump(mode="json")}
     store = None if folder is None else open_store(folder, described)
-    named = {f"{condition.name}-{chunk:04d}": (condition, chunk) for condition, chunk in parts(plan)}
+    named = {f"{condition.name}-{chunk:04d}": (condition, chunk) for condition, chunk in parts(plan, only)}
     calls = {name: (run_part, plan, *part) for name, part in named.items()}
     for name, results in run_parts(calls, store, jobs):
         condition, chunk = named[name]
         yield condition.name, chunk, results
 
 
-def parts(plan: EcssPlan) -> list[tuple[Condition, int]]:
-    """Return all parts of a campaign."""
+def parts(plan: EcssPlan, only: str = "") -> list[tuple[Condition, int]]:
+    """Return all parts of a campaign, or of one of its conditions."""
     return [
         (condition, chunk)
         for condition in plan.conditions()
+        if only in ("", condition.name)
         for chunk in range(math.ceil(condition.frames / plan.chunk))
     ]

@@ -1,18 +1,31 @@
-"""Report of a performance campaign per ECSS-E-ST-60-20C: a data sheet in Markdown, CSV files and plots."""
+"""Report of a performance campaign per ECSS-E-ST-60-20C: a data sheet in Markdown, HTML and PDF, CSV files and plots."""
 
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
-from collections.abc import Iterable, Mapping, Sequence
+import json
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from starhil.emulator.benchmarks.ecss_campaign import DATED, INFLUENCES, REST, STATIC, THERMAL, EcssPlan
+from starhil.emulator.benchmarks.ecss_campaign import (
+    DATED,
+    INFLUENCES,
+    REST,
+    STATIC,
+    THERMAL,
+    EcssDevice,
+    EcssPlan,
+)
 from starhil.emulator.benchmarks.ecss_errors import (
     ABERRATION,
     BIAS,
@@ -23,6 +36,10 @@ from starhil.emulator.benchmarks.ecss_errors import (
     static_errors,
     thermo_elastic_error,
 )
+from starhil.emulator.benchmarks.ecss_requirements import Figure, Requirement
+from starhil.emulator.benchmarks.report_files import as_html, as_pdf
+from starhil.emulator.profile import load_profile
+from starhil.emulator.sensor.model import SensorModel
 from starid.storage.files import write_atomically
 from starid.storage.results import Results
 
@@ -30,7 +47,23 @@ INTERVAL: Final = 0.95
 """Confidence level of the intervals for probabilities."""
 
 SIGMAS: Final = (1, 2, 3)
-"""Standard deviations within which errors are counted; of normal errors, 68.3, 95.4 and 99.7 %."""
+"""Standard deviations within which errors are counted."""
+NORMAL_SHARES: Final = tuple(math.erf(limit / math.sqrt(2.0)) for limit in SIGMAS)
+"""Fractions of normal errors within them: 68.3, 95.4 and 99.7 %."""
+
+AXES: Final = ("x", "y", "z", "across", "about")
+ERRORS: Final = (
+    "bias",
+    "thermo_elastic",
+    "field_of_view",
+    "pixel",
+    "noise",
+    "aberration",
+    "total",
+    "measured",
+)
+"""Names of the errors in requirements, in the order of `EcssReport.all_lines`."""
+OUTCOMES: Final = ("correct", "wrong", "invalid")
 
 PLOTS: Final = {
     "ecss-errors.png": "Attitude errors by kind, across and about the boresight",
@@ -58,6 +91,11 @@ class Outcomes:
         return self.frames - self.correct - self.wrong
 
     @property
+    def counts(self) -> tuple[int, int, int]:
+        """Numbers of frames in the order of `OUTCOMES`."""
+        return self.correct, self.wrong, self.invalid
+
+    @property
     def availability(self) -> float:
         """Fraction of frames with a valid attitude."""
         return (self.correct + self.wrong) / self.frames
@@ -72,12 +110,31 @@ class Stated:
     """Median of the stated ones."""
     shares: tuple[float, ...]
     """Fractions of the errors about each axis within `SIGMAS` stated standard deviations."""
+    frames: int
+    """Number of images; the errors about two axes in one image are not taken as independent."""
+
+    def interval(self, place: int) -> tuple[float, float]:
+        """Return the confidence interval of a share."""
+        return interval(round(self.shares[place] * self.frames), self.frames)
+
+    @property
+    def verdict(self) -> str:
+        """What the comparison with normal errors says."""
+        most, normal = self.interval(2)[1], NORMAL_SHARES[2]
+        if most < normal:
+            return f"**too small**: {100 * self.shares[2]:.1f} % of the errors are within 3σ, where {100 * normal:.1f} % should be"
+        if self.interval(0)[0] > NORMAL_SHARES[0]:
+            return (
+                "larger than the errors: safe; a filter that uses it trusts the attitudes less than it could"
+            )
+        return "consistent with the errors"
 
     @classmethod
     def of(cls, axes: str, errors: np.ndarray, stated: np.ndarray) -> Stated:
         """Compare errors (n, axes) with the stated uncertainties (n,), both in arcseconds."""
         within = np.abs(errors) / stated[:, None]
-        return cls(axes, float(np.median(stated)), tuple(float(np.mean(within <= limit)) for limit in SIGMAS))
+        shares = tuple(float(np.mean(within <= limit)) for limit in SIGMAS)
+        return cls(axes, float(np.median(stated)), shares, len(errors))
 
 
 @dataclass(frozen=True)
@@ -115,6 +172,21 @@ class EcssReport:
         """Errors by kind, their total, and the measured errors."""
         return (*self.lines, self.total, self.measured)
 
+    def named_figures(self) -> dict[str, Figure]:
+        """Return the figures on which there can be requirements; `figure_names` are their names."""
+        figures = {}
+        for name, line in zip(ERRORS, self.all_lines, strict=True):
+            figures.update({f"{name}.{axis}": figure for axis, figure in _axes_of(line)})
+        for outcome in self.outcomes:
+            for what, count in zip(OUTCOMES, outcome.counts, strict=True):
+                shares = (count / outcome.frames, *interval(count, outcome.frames))
+                figures[f"{_condition(outcome.influence, outcome.value)}.{what}"] = _percent(*shares)
+        for axes, item in zip(AXES[3:], self.stated, strict=True):
+            figures[f"stated.{axes}.sigma"] = Figure(item.arcsec, item.arcsec, item.arcsec, "″")
+            for place, limit in enumerate(SIGMAS):
+                figures[f"stated.{axes}.within_{limit}"] = _percent(item.shares[place], *item.interval(place))
+        return figures
+
     def figures(self) -> dict[str, Any]:
         """Return the figures as plain values."""
         lines = {
@@ -146,6 +218,64 @@ class EcssReport:
                 for item in self.stated
             },
         }
+
+
+def figure_names() -> list[str]:
+    """Return the names of all figures on which there can be requirements."""
+    conditions = [
+        REST,
+        *(_condition(name, value) for name, (_, _, values) in INFLUENCES.items() for value in values),
+    ]
+    stated = ("sigma", *(f"within_{limit}" for limit in SIGMAS))
+    return [
+        *(f"{error}.{axis}" for error in ERRORS for axis in AXES),
+        *(f"{condition}.{outcome}" for condition in conditions for outcome in OUTCOMES),
+        *(f"stated.{axes}.{figure}" for axes in AXES[3:] for figure in stated),
+    ]
+
+
+def _condition(influence: str, value: float) -> str:
+    return REST if influence == REST else f"{influence}.{value:g}"
+
+
+def _percent(value: float, low: float, high: float) -> Figure:
+    return Figure(100.0 * value, 100.0 * low, 100.0 * high, " %")
+
+
+def _axes_of(line: ErrorLine) -> Iterator[tuple[str, Figure]]:
+    """Yield the error about each of `AXES`; one that is not significant is known to be below the smallest significant one."""
+    if line.arcsec is None:
+        unknown = Figure(math.nan, 0.0, math.inf, "″")
+        yield from ((axis, unknown) for axis in AXES)
+        return
+    largest = ErrorLine(
+        line.name, np.where(line.arcsec > 0.0, line.arcsec, line.resolution_arcsec), line.arcsec
+    )
+    sizes = [
+        (*each.arcsec, each.across_arcsec, each.about_arcsec)
+        for each in (line, largest)
+        if each.arcsec is not None
+    ]
+    for axis, size, most in zip(AXES, *sizes, strict=True):
+        yield axis, Figure(float(size), float(size), float(most), "″")
+
+
+def subject(plan: EcssPlan) -> dict[str, str]:
+    """Return what a report is about: the camera and its settings, and what has produced the figures."""
+    profile = load_profile(plan.profile, plan.overrides)
+    device = EcssDevice(plan)
+    camera = device.pipeline.camera
+    text = json.dumps(profile.model_dump(mode="json"), sort_keys=True)
+    return {
+        "profile": f"`{plan.profile}`{''.join(f', `{item}`' for item in plan.overrides)}",
+        "checksum of the profile": f"SHA-256 {hashlib.sha256(text.encode()).hexdigest()[:16]}…",
+        "camera": f"{camera.width} × {camera.height} pixels, {camera.fov_deg:.4g}° wide; focal length {camera.focal_px[0]:.5g} pixels",
+        "aperture": f"{1000.0 * SensorModel().with_(**profile.sensor).aperture_m:.3g} mm",
+        "exposure": f"{1000.0 * device.exposure_s:g} ms, gain {device.gain:g}",
+        "unit": profile.unit_source,
+        "version": f"starhil {version('starhil')}",
+        "seed": str(plan.seed),
+    }
 
 
 def make_report(plan: EcssPlan, parts: Iterable[tuple[str, int, Results]], confidence: float) -> EcssReport:
@@ -182,6 +312,32 @@ def make_report(plan: EcssPlan, parts: Iterable[tuple[str, int, Results]], confi
     )
 
 
+def rest_figures(parts: Iterable[tuple[str, int, Results]]) -> dict[str, Any]:
+    """Summarise the frames at rest alone, with the figures of `campaign.summarise` that they have."""
+    rest = _joined([(chunk, results) for _, chunk, results in parts])
+    outcome = _outcomes(REST, 0.0, rest)
+    errors = rest["error_arcsec"][~np.isnan(rest["error_arcsec"]).any(axis=1)]
+    cross, roll = np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2])
+
+    def quantile(values: np.ndarray, share: float) -> float | None:
+        return float(np.quantile(values, share)) if len(values) else None
+
+    valid = outcome.correct + outcome.wrong
+    return {
+        "frames": outcome.frames,
+        "valid": valid,
+        "valid_pct": 100.0 * outcome.availability,
+        "wrong": outcome.wrong,
+        "invalid_reasons": dict(outcome.reasons),
+        "median_arcsec": quantile(cross, 0.5),
+        "p99_arcsec": quantile(cross, 0.99),
+        "max_arcsec": quantile(cross, 1.0),
+        "roll_median_arcsec": quantile(roll, 0.5),
+        "roll_p99_arcsec": quantile(roll, 0.99),
+        "stars_median": float(np.median(rest["labels"][:, 2])),
+    }
+
+
 def _joined(pieces: Sequence[tuple[int, Results]]) -> Results:
     ordered = [results for _, results in sorted(pieces, key=lambda piece: piece[0])]
     return {name: np.concatenate([results[name] for results in ordered]) for name in ordered[0]}
@@ -211,7 +367,12 @@ def interval(count: int, frames: int) -> tuple[float, float]:
     return low, high
 
 
-def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
+def as_markdown(
+    report: EcssReport,
+    command: str,
+    requirements: Sequence[Requirement] = (),
+    plots: Sequence[str] = (),
+) -> str:
     """Return the report as Markdown; `plots` are names of image files in its folder."""
     from jinja2 import StrictUndefined, Template
 
@@ -223,6 +384,10 @@ def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
         interval=INTERVAL,
         sigmas=SIGMAS,
         influences=INFLUENCES,
+        normal=NORMAL_SHARES,
+        verdicts=[(item, report.named_figures()[item.figure]) for item in requirements],
+        subject={**subject(report.plan), "date": f"{datetime.now(UTC):%Y-%m-%d}", "command": f"`{command}`"},
+        size=_size,
         plots={plot: PLOTS[plot] for plot in plots},
         error_row=_error_row,
         shares=_shares,
@@ -247,26 +412,43 @@ def _error_row(line: ErrorLine) -> str:
     return f"| {line.name} | {' | '.join(cells)} | {' | '.join(both)} |"
 
 
+def _size(figure: Figure) -> str:
+    """Return a figure with the interval to which it is known."""
+    if math.isnan(figure.value):
+        return "not evaluated"
+    if figure.low == figure.high:
+        return f"{figure.value:.3g}{figure.unit}"
+    if figure.unit == "″":
+        return f"{figure.value:.3g} to {figure.high:.3g}″"
+    return f"{figure.value:.4g}{figure.unit} ({figure.low:.3g} to {figure.high:.3g})"
+
+
 def _shares(outcome: Outcomes) -> str:
     """Return the cells of correct, wrong and invalid: percentages with confidence intervals."""
     cells = []
-    for count in (outcome.correct, outcome.wrong, outcome.invalid):
+    for count in outcome.counts:
         low, high = interval(count, outcome.frames)
         cells.append(f"{100 * count / outcome.frames:.4g} % ({100 * low:.3g} to {100 * high:.3g})")
     return " | ".join(cells)
 
 
-def write_report(report: EcssReport, folder: Path) -> tuple[Path, ...]:
-    """Write `report.md`, `errors.csv`, `availability.csv` and the plots; return the files."""
+def write_report(
+    report: EcssReport, command: str, requirements: Sequence[Requirement], folder: Path
+) -> tuple[Path, ...]:
+    """Write `report.md`, `.html` and `.pdf`, `errors.csv`, `availability.csv` and the plots; return the files."""
     plots = (_plot_errors(report, folder), _plot_availability(report, folder))
-    texts = {
-        "report.md": as_markdown(report, [plot.name for plot in plots]),
-        "errors.csv": _errors_csv(report),
-        "availability.csv": _availability_csv(report),
+    markdown = as_markdown(report, command, requirements, [plot.name for plot in plots])
+    title = f"Performance of {report.plan.profile}"
+    contents = {
+        "report.md": markdown.encode(),
+        "report.html": as_html(markdown, title, folder).encode(),
+        "report.pdf": as_pdf(markdown, title, folder),
+        "errors.csv": _errors_csv(report).encode(),
+        "availability.csv": _availability_csv(report).encode(),
     }
-    for name, text in texts.items():
-        write_atomically(folder / name, partial(Path.write_text, data=text, encoding="utf-8"))
-    return (*(folder / name for name in texts), *plots)
+    for name, content in contents.items():
+        write_atomically(folder / name, partial(Path.write_bytes, data=content))
+    return (*(folder / name for name in contents), *plots)
 
 
 def _csv(head: str, rows: Iterable[Sequence[object]]) -> str:
@@ -314,10 +496,13 @@ def _plot_availability(report: EcssReport, folder: Path) -> Path:
     for axis, (name, (what, unit, _)) in zip(axes.flat, INFLUENCES.items(), strict=True):
         outcomes = [outcome for outcome in report.outcomes if outcome.influence == name]
         values = [outcome.value for outcome in outcomes]
-        axis.plot(
-            values, [100 * outcome.correct / outcome.frames for outcome in outcomes], "o-", label="correct"
-        )
-        axis.plot(values, [100 * outcome.wrong / outcome.frames for outcome in outcomes], "x-", label="wrong")
+        for what_of, mark, place in (("correct", "o", 0), ("wrong", "x", 1)):
+            shares = np.array([100 * outcome.counts[place] / outcome.frames for outcome in outcomes])
+            limits = 100 * np.array([interval(outcome.counts[place], outcome.frames) for outcome in outcomes])
+            bars = np.abs(limits.T - shares)
+            axis.errorbar(
+                values, shares, bars, fmt=mark, markersize=4, capsize=2, linewidth=0.8, label=what_of
+            )
         axis.set_xlabel(f"{what}, {unit}" if unit else what)
         axis.set_ylim(-3, 103)
         if max(values) > 20.0 * max(min(value for value in values if value > 0.0), 1e-9):

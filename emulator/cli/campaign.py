@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import shlex
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -20,6 +22,10 @@ from starid.storage.child_processes import importing_only_what_is_installed
 
 if TYPE_CHECKING:
     from starhil.emulator.benchmarks.campaign import CampaignPlan
+    from starhil.emulator.benchmarks.ecss_campaign import EcssPlan
+
+WORKERS_S: Final = 60
+"""Time for which a Dask scheduler may be without workers."""
 
 _COLUMNS: Final[tuple[Column, ...]] = (
     ("figure", lambda row: row[0]),
@@ -36,12 +42,17 @@ _ALGORITHM_COLUMNS: Final[tuple[Column, ...]] = (
     ("algorithm", lambda row: row["algorithm"]),
     ("frames", lambda row: str(row["frames"])),
     ("valid %", _number("valid_pct", 1)),
+    ("1 SE", _number("standard_error_pct", 1)),
     ("wrong", lambda row: str(row["wrong"])),
     ("within .3 %", _number("within_pct", 1)),
     ("across deg", _number("across_deg", 4)),
     ("about deg", _number("about_deg", 4)),
+    ("stated deg", _number("stated_deg", 4)),
     ("chi2", _number("normalised_squared_error", 2)),
+    ("region", lambda row: str(row["in_region"])),
     ("triggers", lambda row: str(row["triggers"])),
+    ("stars kept %", _number("true_kept_pct", 0)),
+    ("false kept %", _number("false_kept_pct", 0)),
     ("ms", _number("median_ms", 2)),
     ("p99 ms", _number("p99_ms", 1)),
     ("kB", _number("kilobytes", 0)),
@@ -71,7 +82,37 @@ class EcssOptions:
         int, typer.Option(min=3, help="Number of directions in the sky, to separate the kinds of error.")
     ] = 80
     seed: Seed = 1
+    requirements: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML file of limits on figures; the report says which are met (--figures: their names)."
+        ),
+    ] = None
     jobs: Jobs = 1
+
+    def plan(self) -> EcssPlan:
+        """Return the plan."""
+        from starhil.emulator.benchmarks.ecss_campaign import EcssPlan
+
+        return EcssPlan(
+            self.profile,
+            tuple(with_orbit(self.setting, self.orbit)),
+            self.seed,
+            fields=self.fields,
+            rest_frames=self.rest_frames,
+            frames=self.frames,
+        )
+
+    def command(self) -> str:
+        """Return the command that makes the same report."""
+        words = ["starhil", "campaign", "--ecss", "--profile", self.profile]
+        words += [] if self.orbit is None else ["--orbit", self.orbit]
+        for setting in self.setting or ():
+            words += ["--set", setting]
+        for name in ("confidence", "rest_frames", "frames", "fields", "seed", "requirements"):
+            if (value := getattr(self, name)) is not None:
+                words += [f"--{name.replace('_', '-')}", str(value)]
+        return shlex.join(words)
 
 
 @group.callback()
@@ -95,47 +136,57 @@ def campaigns(
             help="Folder for report.md, CSV files, plots and finished parts. A second run resumes from it.",
         ),
     ] = None,
+    figures: Annotated[
+        bool, typer.Option("--figures", help="List the names of figures for --requirements, and end.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure the accuracy and reliability of attitudes over many rendered images.
 
     With --ecss: attitude errors by kind, and rates of correct, wrong and invalid attitudes against body rate,
-    Sun, Moon, Earth, false stars and particles. The exit status is 1 if any attitude at rest is wrong. For
-    speed, latency and other solvers, see `starhil bench`.
+    Sun, Moon, Earth, false stars and particles. The exit status is 1 if any attitude at rest is wrong, or a requirement is not
+    shown to be met. For speed, latency and other solvers, see `starhil bench`.
     """
     if context.invoked_subcommand is not None:
         if ecss:
             raise typer.BadParameter(f"--ecss takes no subcommand; remove {context.invoked_subcommand}")
         return
-    if not ecss:
+    if not ecss and not figures:
         typer.echo(context.get_help())
         raise typer.Exit(2)
-    from starhil.emulator.benchmarks.ecss_campaign import EcssPlan, parts, run_ecss
+    from starhil.emulator.benchmarks.ecss_campaign import parts, run_ecss
     from starhil.emulator.benchmarks.ecss_errors import coverage_factor
-    from starhil.emulator.benchmarks.ecss_report import as_markdown, make_report, write_report
+    from starhil.emulator.benchmarks.ecss_report import as_markdown, figure_names, make_report, write_report
+    from starhil.emulator.benchmarks.ecss_requirements import read_requirements
 
+    if figures:
+        print("\n".join(figure_names()))
+        return
     coverage_factor(images.confidence)  # before hours of work
+    wanted = () if images.requirements is None else read_requirements(images.requirements, figure_names())
     if output is not None:
         import_module("matplotlib")
-    plan = EcssPlan(
-        images.profile,
-        tuple(with_orbit(images.setting, images.orbit)),
-        images.seed,
-        fields=images.fields,
-        rest_frames=images.rest_frames,
-        frames=images.frames,
-    )
+        import_module("fpdf")
+    plan = images.plan()
+    _warn(plan)
     folder = None if output is None else output / "parts"
     finished = list(_with_progress(run_ecss(plan, folder=folder, jobs=images.jobs), len(parts(plan))))
     report = make_report(plan, finished, images.confidence)
-    files = () if output is None else write_report(report, output)
+    files = () if output is None else write_report(report, images.command(), wanted, output)
+    measured = report.named_figures()
+    verdicts = {item.id: item.verdict(measured[item.figure]) for item in wanted}
     if as_json:
-        print(json.dumps({**report.figures(), "files": [str(file) for file in files]}))
+        print(
+            json.dumps({**report.figures(), "requirements": verdicts, "files": [str(file) for file in files]})
+        )
     elif output is None:
-        print(as_markdown(report))
+        print(as_markdown(report, images.command(), wanted))
     else:
-        print(f"report written to {output / 'report.md'}")
-    if report.outcomes[0].wrong:
+        print(f"report written to {output / 'report.md'}, .html and .pdf")
+        for item, verdict in verdicts.items():
+            if verdict != "met":
+                print(f"{item}: {verdict}")
+    if report.outcomes[0].wrong or set(verdicts.values()) - {"met"}:
         raise typer.Exit(1)
 
 
@@ -145,6 +196,15 @@ class PlanOptions:
 
     frames: Annotated[int, typer.Option(min=1, help="Number of images.")] = 1000
     seed: Seed = 1
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            help="Device profile, a name or a TOML file, whose camera, detector and parameters are used; "
+            "instead of the options from --fov on.",
+            autocompletion=names_of("profile"),
+        ),
+    ] = None
+    setting: Settings = None
     fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0
     unknown_field: Annotated[
         bool,
@@ -166,6 +226,23 @@ class PlanOptions:
             "and rates up to 2 deg/s."
         ),
     ] = "clear"
+
+    def device_plan(self) -> EcssPlan | None:
+        """Return the plan for the device of a profile, or None if there is no profile.
+
+        Raises typer.BadParameter: an option contradicts it.
+        """
+        from starhil.emulator.benchmarks.ecss_campaign import EcssPlan
+
+        if self.profile is None:
+            if self.setting:
+                raise typer.BadParameter("--set overrides a key of --profile; give one")
+            return None
+        for item in fields(self)[-6:]:
+            if getattr(self, item.name) != item.default:
+                option = f"--{item.name.replace('_', '-')}"
+                raise typer.BadParameter(f"{option} and --profile exclude each other; use --set")
+        return EcssPlan(self.profile, tuple(self.setting or ()), self.seed, rest_frames=self.frames)
 
     def plan(self) -> CampaignPlan:
         """Return the plan."""
@@ -213,12 +290,22 @@ def lost_in_space(
     import numpy as np
 
     from starhil.emulator.benchmarks.campaign import run_campaign, summarise
+    from starhil.emulator.benchmarks.ecss_campaign import REST, parts, run_ecss
+    from starhil.emulator.benchmarks.ecss_report import rest_figures
 
-    plan = images.plan()
-    with _backend(dask, jobs):
-        chunks = list(_with_progress(run_campaign(plan, folder=output, jobs=jobs), plan.chunks))
-    rows = np.concatenate(chunks)
-    figures: dict[str, Any] = {"seed": images.seed, **summarise(rows, images.fov)}
+    figures: dict[str, Any] = {"seed": images.seed}
+    if (device := images.device_plan()) is not None:
+        _warn(device)
+        with _backend(dask, jobs):
+            shown = _with_progress(
+                run_ecss(device, folder=output, jobs=jobs, only=REST), len(parts(device, REST))
+            )
+            figures |= rest_figures(shown)
+    else:
+        plan = images.plan()
+        with _backend(dask, jobs):
+            chunks = list(_with_progress(run_campaign(plan, folder=output, jobs=jobs), plan.chunks))
+        figures |= summarise(np.concatenate(chunks), images.fov)
     if as_json:
         print(json.dumps(figures))
     else:
@@ -240,6 +327,20 @@ def algorithms(
     lost_only: Annotated[
         bool, typer.Option("--lost-only", help="Only images at random attitudes with nothing wrong.")
     ] = False,
+    scene: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TEXT", help="Only conditions with this text in their name, such as '0.3 deg/s'."
+        ),
+    ] = None,
+    part: Annotated[
+        str | None,
+        typer.Option(
+            "--without",
+            metavar="PART",
+            help="Take away a part of the thesis's algorithms: features, weights, motion or region.",
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare geometric, thesis, and thesis with refinement on the same rendered images.
@@ -249,9 +350,10 @@ def algorithms(
     is wrong.
     """
     from starhil.emulator.benchmarks.algorithms import SCENES, AlgorithmPlan, run_algorithms
+    from starid.identification.thesis.ablations import checked_part
 
-    plan = AlgorithmPlan(profile, frames, seed, tuple(with_orbit(setting, orbit)))
-    scenes = SCENES[:1] if lost_only else SCENES
+    plan = AlgorithmPlan(profile, frames, seed, tuple(with_orbit(setting, orbit)), checked_part(part))
+    scenes = SCENES[:1] if lost_only else tuple(each for each in SCENES if (scene or "") in each.name)
     rows = list(_with_progress(run_algorithms(plan, scenes), 3 * len(scenes)))
     if as_json:
         print(json.dumps(rows))
@@ -289,10 +391,20 @@ def _backend(dask: str | None, jobs: int) -> Iterator[None]:
             client = stack.enter_context(Client(address, timeout="10s"))
         except (OSError, ValueError) as error:
             raise EmulatorError(f"campaign: no Dask scheduler at {dask!r}: {error}") from error
-        if not client.ncores():
-            raise EmulatorError(f"campaign: the Dask scheduler at {dask!r} has no workers: start some")
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_S)
+        except TimeoutError:
+            raise EmulatorError(
+                f"campaign: the Dask scheduler at {dask!r} has no workers after {WORKERS_S} s: start some"
+            ) from None
         stack.enter_context(parallel_config(backend="dask", client=client))
         yield
+
+
+def _warn(plan: EcssPlan) -> None:
+    """Say on stderr if the camera sees too few stars."""
+    if warning := plan.warning():
+        print(f"starhil: campaign: {warning}", file=sys.stderr)
 
 
 def _with_progress(chunks: Any, total: int) -> Any:

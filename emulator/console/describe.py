@@ -56,7 +56,7 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
         "clock": run.clock.name,
         "links": links,
         "buses": {**BUSES, CONSOLE_BUS: "console's own line"},
-        "camera": head.warm.camera if head.warm is not None else head.profile.camera.values(),
+        "camera": head.warm.camera if head.warm is not None else head.profile.camera_values,
         "unit": {"name": icd.name, "version": icd.version},
         "telecommands": [describe_row(row, icd) for row in icd.rows if row.kind == "telecommand"],
         "telemetry": [describe_row(row, icd) for row in sorted(icd.readable, key=lambda row: row.id)],

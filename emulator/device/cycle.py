@@ -45,7 +45,7 @@ from starhil.emulator.truth.source import TruthState
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.icd.values import Value
 from starid.arrays import Array
-from starid.attitude import Attitude
+from starid.attitude import ARCSEC_PER_RAD, Attitude
 from starid.identification.attitude_history import AttitudeHistory
 
 log = logging.getLogger("starhil.device")
@@ -249,6 +249,9 @@ class FrameCycle:
         predicted = self._predict(mid_ns) if mode is Mode.TRACKING else None
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
         request = self._request(truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
+        if predicted is not None and self._parameters["prediction_enable"]:
+            error = self._history.covariance(mid_ns)
+            request = replace(request, prediction_covariance=error, predicted_rate_rad_s=self._history.rate())
         self._in_flight.append(frame)
         ready_ns = self._ready_ns(start_ns, exposure_s, period_s, tracking=frame.tracking)
         self._imager.submit(request, self._until_stopped(partial(self._result_arrived, frame)))
@@ -407,7 +410,11 @@ class FrameCycle:
                 self._history.interrupt()
             return False, result.reason, None
         attitude = Attitude(np.array(result.quaternion_xyzw))
-        self._history.add(frame.mid_ns, attitude, LONGEST_GAP_PERIODS * frame.period_s)
+        across, about = (
+            sigma / ARCSEC_PER_RAD for sigma in (result.sigma_cross_arcsec, result.sigma_roll_arcsec)
+        )
+        known = np.diag([across**2, across**2, about**2]) if min(across, about) > 0.0 else None
+        self._history.add(frame.mid_ns, attitude, LONGEST_GAP_PERIODS * frame.period_s, known)
         rate = result.rate_rad_s or self._history.rate()
         if processing_s * 1000.0 > float(self._parameters["detection_timeout"]):
             return False, "timeout", rate

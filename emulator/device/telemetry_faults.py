@@ -61,7 +61,7 @@ class TelemetryFault(Strict):
     count: Annotated[int, Field(ge=1, le=1_000_000)] | None = None
     """Number of messages to affect, after which the fault ends; omitted: no limit."""
     after_s: Duration = 0.0
-    """Time from the injection to the begin of the fault."""
+    """Time from the injection to the beginning of the fault."""
     for_s: Duration | None = None
     """Duration, in each period if `every_s` is given; omitted: no limit."""
     every_s: Duration | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TypeAlias
 
 from starhil.emulator.profile.profile import Profile
@@ -33,7 +34,7 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
     """Return the pipeline configuration of a profile; `repeatable`: results independent of machine speed."""
     path = profile.catalog.path
     return PipelineSetup(
-        camera=profile.camera.values(),
+        camera=profile.camera_values,
         sensor=dict(profile.sensor),
         sky=dict(profile.sky),
         identifier=dict(profile.identifier),
@@ -45,6 +46,9 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
         build_in_background=profile.run.clock != "stepped" and not repeatable,
         previews=previews,
         dark_frames=profile.device.dark_frames,
+        tracking_stars=profile.device.tracking_stars,
+        tracking_error_rad=math.radians(profile.device.tracking_error_deg),
+        tracking_windows=profile.device.tracking_windows,
         calibration=profile.calibration.matrix(),
         exposure_s=float(profile.parameters.get("exposure", 200)) / 1000.0,
         images=profile.images.resolved(profile.folder),

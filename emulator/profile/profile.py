@@ -118,6 +118,17 @@ class Profile(Strict):
             raise ValueError('images: run.worker = "error_model" uses no images; choose process or thread')
         return self
 
+    @model_validator(mode="after")
+    def _pixels_of_focal_length(self) -> Self:
+        if self.camera.focal_mm is not None and "pixel_um" not in self.sensor:
+            raise ValueError("camera.focal_mm: needs the width of a pixel: give sensor.pixel_um")
+        return self
+
+    @property
+    def camera_values(self) -> dict[str, Any]:
+        """Keys that `starid.camera.Camera.from_dict` reads."""
+        return self.camera.values(float(self.sensor.get("pixel_um", SensorModel.pixel_um)))
+
     @property
     def start_unix_s(self) -> float:
         """Date of the sky, the orbit and the bodies at the start of the run, as Unix time."""
@@ -161,6 +172,7 @@ class Profile(Strict):
 
 ALTERNATIVES: Final = (
     (frozenset({"fov_deg"}), frozenset({"focal_px", "centre_px"})),
+    (frozenset({"fov_deg"}), frozenset({"focal_mm"}), frozenset({"focal_px"})),
     (frozenset({"ra_deg", "dec_deg", "roll_deg"}), frozenset({"quaternion_xyzw"})),
     (frozenset({"quaternion_xyzw"}), frozenset({"matrix"}), frozenset({"euler_deg", "sequence"})),
 )
@@ -304,7 +316,7 @@ def camera_of(name_or_path: str) -> Camera:
         profile = load_profile(name_or_path)
     except EmulatorError as error:
         raise StaridError(str(error)) from None
-    return Camera.from_dict(profile.camera.values())
+    return Camera.from_dict(profile.camera_values)
 
 
 def _source_of(layers: Sequence[Layer], location: Sequence[object]) -> str:

@@ -68,9 +68,11 @@ class CameraConfig(Strict):
     height: Annotated[int, Field(ge=64, le=4096)] = 937
     """Rows of the pixel array."""
     fov_deg: Annotated[float, Field(ge=1.0, le=120.0)] | None = None
-    """Field of view along a row, edge to edge; 42 if neither this nor `focal_px` is given."""
+    """Field of view along a row, edge to edge; 42 if no focal length is given."""
     focal_px: Annotated[list[FocalLength], Field(min_length=2, max_length=2)] | None = None
     """Focal length along x and y, instead of `fov_deg`."""
+    focal_mm: Annotated[float, Field(ge=0.1, le=10_000.0)] | None = None
+    """Focal length, instead of `fov_deg`, for pixels of `sensor.pixel_um`."""
     centre_px: Annotated[list[PixelPosition], Field(min_length=2, max_length=2)] | None = None
     """Position of the optical axis on the pixel array; default: the centre."""
     model: Literal["pinhole", "equidistant", "flat"] = "pinhole"
@@ -78,9 +80,12 @@ class CameraConfig(Strict):
     distortion: list[DistortionTerm] = Field(default_factory=list, max_length=5)
     """Brown–Conrady coefficients k1, k2, p1, p2, k3."""
 
-    def values(self) -> dict[str, Any]:
-        """Return the keys that `starid.camera.Camera.from_dict` reads."""
+    def values(self, pixel_um: float) -> dict[str, Any]:
+        """Return the keys that `starid.camera.Camera.from_dict` reads, for pixels of this width."""
         values = self.model_dump(exclude_none=True)
+        if self.focal_mm is not None:
+            focal_px = 1000.0 * values.pop("focal_mm") / pixel_um
+            values["focal_px"] = [focal_px, focal_px]
         if "focal_px" not in values:
             values.setdefault("fov_deg", 42.0)
         return values
@@ -101,6 +106,14 @@ class DeviceConfig(Strict):
     """Time in boot mode after a start or reset, in simulation time."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Number of valid frames from which the body rate is estimated, if the star identifier does not do so."""
+    tracking_stars: Literal[0] | Annotated[int, Field(ge=2, le=50)] = 2
+    """Least number of matched stars in tracking, where the predicted attitude verifies few stars, which may then be fainter
+    (3 sigmas). 0: `min_stars_matched`, as lost in space."""
+    tracking_error_deg: Annotated[float, Field(ge=0.001, le=10.0)] = 0.1
+    """Largest error of an attitude by few stars that may go unnoticed if the predicted attitude is wrong by many times its
+    uncertainty, degrees. Smaller values reject more frames with a mostly covered field."""
+    tracking_windows: bool = False
+    """Whether the unit searches only windows around the predicted stars when it tracks, and the whole image only if that fails."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
     """Number of frames averaged into the dark frame that the unit subtracts from each image; 0: none."""
 

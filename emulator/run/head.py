@@ -38,6 +38,8 @@ from starhil.emulator.run.pump import ClockPump
 from starhil.emulator.run.revival import PipelineRevival
 from starhil.emulator.run.tape import PipelineState
 from starhil.emulator.run.wiring import Wiring
+from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sensor.pipeline.error_model import few_stars
 from starhil.emulator.sensor.pipeline.messages import IndexRequest, PipelineReady, camera_constants
 from starhil.emulator.simulation.clock import Clock
 from starhil.emulator.simulation.guard import close_all
@@ -173,6 +175,10 @@ class Head:
             device.signals.mode_changed.connect(self._mode_changed)
             device.signals.restarted.connect(self._device_reset)
             self._adopt(warm)
+            if warning := few_stars(
+                warm.camera, SensorModel().with_(**self.profile.sensor), device.parameters
+            ):
+                log.warning("%s", warning)
             if self.device.cycle.index_request() != prepared:  # the OBC has set parameters during the boot
                 self._prepare_index()
             self._on_warm()

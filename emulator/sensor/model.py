@@ -30,7 +30,7 @@ Bits: TypeAlias = Literal[8, 12, 16]
 class SensorModel:
     """Optics and detector of a star sensor; the defaults have the field and the pixels of CubeStar, and a far larger lens.
 
-    A 12 mm f/1.2 lens of 14.6 mm focal length images 42° onto 937 pixels of 12 µm. A star of V = 0 and solar
+    A lens of 14.6 mm focal length and 12 mm aperture (f/1.2) images 42° onto 937 pixels of 12 µm. A star of V = 0 and solar
     colour yields 4.6e10 photons/s/m² between 400 and 900 nm: 3.63e-11 W/m²/nm at 550 nm are 1.0e8
     photons/s/m²/nm (Bessell 1979), of which the photon spectrum of a G2 star averages 0.92 over the 500 nm.
     With a transmission of 0.75 and a quantum efficiency of 0.45 this gives 1.8e6 electrons/s, or 1 400 in 0.2
@@ -52,8 +52,12 @@ class SensorModel:
     """Standard deviation of the Gaussian spot at the image centre, pixels. 0.8 is about the smallest spot that can be
     fitted without pixel-phase error."""
     psf_growth: float = limited(0.0, 5.0, 0.0, unit="fraction")
-    """Relative increase of the spot width from the image centre to the edge: along x with the square of x, along y
-    with the square of y."""
+    """Relative increase of the spot width from the image centre to the middle of an edge, with the square of the distance from
+    the centre: twice as large in the corners."""
+    vignetting: int = limited(0, 8, 0, unit="exponent")
+    """Light at an angle θ from the optical axis is cosⁿθ of that on it; this is n. 1: the pupil, seen from there, is
+    narrower, and nothing else cuts off the light of a star. An extended source on a flat detector has cos⁴θ, because a pixel
+    there also sees less of it (cos³θ); a diaphragm or a rim of the lens cuts off more."""
     gain: float = limited(0.01, 1000.0, 1.0, unit="times")
     """Analog gain before the converter."""
     bits: Bits = 8
@@ -133,6 +137,19 @@ class SensorModel:
         exposure = self.exposure_s if exposure_s is None else exposure_s
         return self.zero_magnitude_e_s * exposure * math.pow(10.0, -0.4 * magnitude)
 
+    def faintest_magnitude(self, pixel_scale_rad: float, threshold: float) -> float:
+        """Return the magnitude of a star whose signal in the matched filter is `threshold` standard deviations of the noise.
+
+        That is the magnitude at which about half of the stars are found: electrons = threshold·σ·√(4π s²), with the noise σ of
+        a pixel and the mean width s of a spot, that of the pixel included.
+        """
+        dark_e_s = self.dark_e_s * self.dark_factor(self.temperature_c)
+        light = (self.sky_e_s(pixel_scale_rad) + dark_e_s) * self.exposure_s
+        noise_e = math.sqrt(light + self.read_noise_e**2 + self.gain_e_per_dn**2 / 12.0)
+        spot_px = math.hypot(self.psf_sigma_px * (1.0 + self.psf_growth / 3.0), 1.0 / math.sqrt(12.0))
+        electrons = threshold * noise_e * math.sqrt(4.0 * math.pi) * spot_px
+        return -2.5 * math.log10(electrons / (self.zero_magnitude_e_s * self.exposure_s))
+
     def sky_e_s(self, pixel_scale_rad: float) -> float:
         """Return electrons/s per pixel from the sky background, for pixels of width `pixel_scale_rad`."""
         arcsec2 = pixel_scale_rad**2 * ARCSEC2_PER_SR
@@ -159,6 +176,11 @@ class SensorModel:
         """Return the rotation vector (3,) of the optics relative to the mounting, radians, sensor frame."""
         drift = np.array([self.boresight_drift_x, self.boresight_drift_y, self.boresight_drift_z])
         return np.asarray(drift * ((temperature_c - self.reference_c) / ARCSEC_PER_RAD))
+
+    @property
+    def mean_psf_sigma_px(self) -> float:
+        """Standard deviation of the spot, averaged over a square field: the mean square of the distance is 2/3 there."""
+        return self.psf_sigma_px * (1.0 + self.psf_growth * 2.0 / 3.0)
 
     @property
     def max_dn(self) -> int:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
+from starhil.emulator.sensor.fixed_pattern import FixedPattern, make_fixed_pattern
 from starhil.emulator.sensor.model import SOLAR_COLOUR_B_V, SensorModel
 from starhil.emulator.sensor.noise import digitize
 from starhil.emulator.sensor.particle_hits import add_protons
@@ -150,7 +150,8 @@ class Renderer:
         self._parallax_rad = np.radians(parallax_mas / 3.6e6)
         self._flux_e_s = self.sensor.zero_magnitude_e_s * 10.0 ** (-0.4 * brightness[self._rows])
         self._cos_cone = math.cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
-        self._pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
+        pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
+        self._pattern = _vignetted(pattern, camera, self.sensor.vignetting)
         self._sky_e_s = np.float32(self.sensor.sky_e_s(camera.pixel_scale_rad))
         self._still = np.empty((camera.height, camera.width), dtype=np.float32)
         self._still_conditions = (math.nan, math.nan)
@@ -366,10 +367,27 @@ class Renderer:
         base = self.sensor.psf_sigma_px
         half = 0.5 * np.array([self.camera.width, self.camera.height])
         off_axis = (path[:, :2] + 0.5 - half) / half
-        sigma = base * (1.0 + self.sensor.psf_growth * off_axis**2)
+        width = base * (1.0 + self.sensor.psf_growth * np.sum(off_axis**2, axis=1))
+        sigma = np.column_stack([width, width])
         longest = 2.0 * float(np.max(np.hypot(path[:, 2], path[:, 3]), initial=0.0))
         nodes, weights = path_rule(longest, base)
         add_spots(mean, self._pattern.sensitivity, path, electrons, sigma, nodes, weights)
+
+
+def _vignetted(pattern: FixedPattern, camera: Camera, power: int) -> FixedPattern:
+    """Return a pattern whose sensitivity falls with a power of the cosine of the angle from the optical axis."""
+    return (
+        pattern if power == 0 else replace(pattern, sensitivity=pattern.sensitivity * _falloff(camera, power))
+    )
+
+
+@lru_cache(maxsize=2)
+def _falloff(camera: Camera, power: int) -> Array32:
+    """Power (h, w) of the cosine of the angle of each pixel from the optical axis."""
+    rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
+    directions = camera.back_project(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
+    cosine = np.maximum(directions[:, 2], 0.0).reshape(camera.height, camera.width)
+    return np.asarray(np.prod([cosine] * power, axis=0), dtype=np.float32)
 
 
 def render(

@@ -377,8 +377,8 @@ class _System:
             weight = sigma[used] ** -2.0
             if robust:
                 weight = weight * np.minimum(1.0, _HUBER / np.maximum(lengths, _HUBER))[:, None]
-            by_camera = _camera_jacobian(params, vectors) @ bundle.free_to_all
-            by_rotation = _rotation_jacobian(params, vectors)
+            by_camera = camera_jacobian(params, vectors) @ bundle.free_to_all
+            by_rotation = rotation_jacobian(params, vectors)
             weighted_by_rotation = by_rotation * weight[:, :, None]
             weighted_by_camera = by_camera * weight[:, :, None]
             self.cc = self.cc + np.einsum("nij,nik->jk", weighted_by_camera, by_camera)
@@ -459,10 +459,10 @@ def attitude_covariance(
     """
     count = len(xy_px)
     vectors = camera.back_project(xy_px)
-    errors = _error_matrices(errors_px)
+    errors = error_matrices(errors_px)
     whiten = np.linalg.inv(np.linalg.cholesky(errors))
-    rotation = (whiten @ _rotation_jacobian(camera.params, vectors)).reshape(2 * count, 3)
-    displaced = (whiten @ _camera_jacobian(camera.params, vectors) @ _root(covariance)).reshape(2 * count, 9)
+    rotation = (whiten @ rotation_jacobian(camera.params, vectors)).reshape(2 * count, 3)
+    displaced = (whiten @ camera_jacobian(camera.params, vectors) @ _root(covariance)).reshape(2 * count, 9)
     offset = (whiten @ offset_px[:, :, None]).reshape(2 * count)
     inverse = np.linalg.inv(rotation.T @ rotation)
     turn = inverse @ rotation.T @ displaced
@@ -475,7 +475,7 @@ def attitude_covariance(
     return np.asarray(unit * student * inverse + turn @ turn.T), noise_px
 
 
-def _error_matrices(errors_px: Array) -> Array:
+def error_matrices(errors_px: Array) -> Array:
     """Return covariances (n, 2, 2) of positions; see `attitude_covariance`."""
     if errors_px.ndim == 3:
         return errors_px
@@ -491,7 +491,7 @@ def _root(covariance: Array) -> Array:
     return np.asarray(scale[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _rotation_jacobian(params: Array, vectors: Array) -> Array:
+def rotation_jacobian(params: Array, vectors: Array) -> Array:
     """Derivative (n, 2, 3) of the positions with respect to a sensor rotation e, px/rad: J (v × e)."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
@@ -500,7 +500,7 @@ def _rotation_jacobian(params: Array, vectors: Array) -> Array:
     return slopes
 
 
-def _camera_jacobian(params: Array, vectors: Array) -> Array:
+def camera_jacobian(params: Array, vectors: Array) -> Array:
     """Derivative (n, 2, 9) of the positions with respect to the camera parameters `NAMES`."""
     bare = params.copy()
     bare[list(_SLOTS)] = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -17,6 +17,7 @@ from starid.arrays import Array, Indices32, elementwise
 from starid.catalog.aberration import aberrated
 from starid.catalog.hipparcos import EPOCH, default_path, read_hip2
 from starid.catalog.photometry import absolute_magnitude, fitted_share, flux_ratio, v_from_hp
+from starid.catalog.published import PUBLISHED_V, with_missing_stars
 from starid.errors import StaridError
 from starid.storage.cache import cached_tables
 
@@ -27,16 +28,13 @@ DEFAULT_EPOCH: Final = 2026.0
 
 _RAD_PER_MAS: Final = math.pi / (180.0 * 3600.0 * 1000.0)
 _EPOCH_RANGE: Final = (1800.0, 2200.0)
-_FORMAT: Final = 2
+_FORMAT: Final = 3
 _NARROWEST_STRIP: Final = 1e-4
 """Narrowest strip in the search for close pairs: places within it remain exact."""
 _PER_STAR: Final = (
     *("hip", "vectors", "ra_rad", "dec_rad", "hp", "v", "b_v", "v_i"),
     *("parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr"),
 )
-
-_SATURATED_V: Final = {32349: -1.44}
-"""Published V of stars too bright for Hipparcos: Sirius, whose Hp is 0.34 mag too faint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +205,8 @@ def load_catalog(path: str | Path | None = None, epoch: float = DEFAULT_EPOCH) -
     Returns
     -------
     StarCatalog
-        All 117 955 stars, brightest first. They are cached (`starid.storage.cache.cache_dir`).
+        The 117 955 stars of the file and those that it lacks (`starid.catalog.published`), brightest first. They are cached
+        (`starid.storage.cache.cache_dir`).
 
     Raises
     ------
@@ -244,7 +243,7 @@ def load_catalog(path: str | Path | None = None, epoch: float = DEFAULT_EPOCH) -
 
 def _tables(source: Path, epoch: float) -> dict[str, NDArray[np.generic]]:
     """Read the columns of the file, move the stars to an epoch, add V, and order the stars brightest first."""
-    columns = read_hip2(source)
+    columns = with_missing_stars(read_hip2(source))
     vectors = moved(
         columns["ra_rad"], columns["dec_rad"], columns["pm_ra_mas_yr"], columns["pm_dec_mas_yr"], epoch
     )
@@ -254,7 +253,7 @@ def _tables(source: Path, epoch: float) -> dict[str, NDArray[np.generic]]:
     dec = elementwise(math.atan2, z, np.sqrt(x * x + y * y))
     columns |= {"vectors": vectors, "ra_rad": ra, "dec_rad": dec}
     v = v_from_hp(columns["hp"], columns["b_v"], columns["v_i"])
-    for hip, published in _SATURATED_V.items():
+    for hip, published in PUBLISHED_V.items():
         v[columns["hip"] == hip] = published
     order = np.lexsort((columns["hip"], v))
     return {name: values[order] for name, values in {**columns, "v": v}.items()}

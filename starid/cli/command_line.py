@@ -32,7 +32,10 @@ EXIT_INTERRUPTED: Final = 130
 USAGE_ERROR: Final[type[Exception]] = typer.BadParameter.__mro__[1]
 """Base class of errors about options; which library defines it depends on typer's version."""
 
-EXTRAS: Final = {**dict.fromkeys(("joblib", "matplotlib", "sklearn"), "lab"), "mcap": "mcap"}
+EXTRAS: Final = {
+    **dict.fromkeys(("fpdf", "joblib", "markdown_it", "matplotlib", "sklearn"), "lab"),
+    "mcap": "mcap",
+}
 """Package → extra of the installation that brings it."""
 
 

@@ -37,6 +37,9 @@ class Reason(StrEnum):
     BAD_INPUT = "bad_input"
 
 
+Search = Literal["lsi", "rsi"]
+
+
 @dataclass(frozen=True, slots=True)
 class FeatureReport:
     """How an algorithm of the thesis found, or did not find, the attitude of one image.
@@ -70,7 +73,7 @@ class FeatureReport:
         The attitude was refined and verified with matched stars; otherwise it is that of the features alone.
     """
 
-    search: Literal["lsi", "rsi"]
+    search: Search
     triggered: bool = False
     error_psi: float = math.nan
     cell: int = -1

@@ -60,8 +60,9 @@ class Background:
 
     @cached_property
     def median_noise(self) -> float:
-        """Typical noise of a pixel, counts."""
-        return median(self.noise)
+        """Typical noise of a pixel, counts, where light reaches the image: blocks without any noise are left out."""
+        lit = self.noise[self.noise > np.float32(1.001 * MIN_NOISE_DN)]
+        return median(lit if lit.size else self.noise)
 
 
 @compiled_ieee

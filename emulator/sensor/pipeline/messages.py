@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 import struct
 from collections.abc import Mapping
@@ -102,6 +103,12 @@ class PipelineSetup:
     calibration: list[list[float]] | None = None
     """Covariance (9, 9) of the calibrated camera's parameters, as in `starid.camera.calibration.Calibration`; None: they are
     exact."""
+    tracking_stars: int = 2
+    """Least number of stars in tracking if the error of the prediction is known; 0: as lost in space."""
+    tracking_error_rad: float = math.radians(0.1)
+    """Largest error that few stars may leave unnoticed if the prediction is wrong, radians."""
+    tracking_windows: bool = False
+    """Whether to search only windows around predicted stars first, when tracking."""
     exposure_s: float = 0.2
     """Exposure in which the limit of the detector is measured, for the algorithms that count stars."""
     images: dict[str, Any] = field(default_factory=dict)
@@ -146,6 +153,10 @@ class FrameRequest:
     """Whether to detect and identify stars; if false, the image is only rendered and kept for download."""
     predicted: Attitude | None = None
     """Predicted attitude at mid-exposure, for tracking; None: lost in space."""
+    prediction_covariance: Array | None = None
+    """Covariance (3, 3) of its error, rad², sensor frame; None: not known."""
+    predicted_rate_rad_s: Triple | None = None
+    """Body rate at the prediction; None: not known."""
     faults: dict[str, Any] = field(default_factory=dict)
     """Fields of the sky objects that are overridden by the control channel."""
     temperature_c: float | None = None

@@ -6,18 +6,20 @@ measured as a laboratory would: fields of the sky at rest are rendered and their
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.special import expit
 
 from starhil.emulator.sensor.renderer import Frame
-from starid.arrays import Array
+from starid.arrays import Array, Mask
 from starid.attitude import Attitude, random_attitude
 from starid.imaging.detection import Detections
 
-FIELDS: Final = 24
+FIELDS: Final = 96
 """Number of fields rendered."""
 
 FOUND_SHARE: Final = 0.9
@@ -27,11 +29,20 @@ _FIRST_INDEX: Final = 1 << 40
 """Numbers of these exposures, beyond those of any run, so that their noise is independent."""
 
 _SEED: Final = 24
-_BIN_MAG: Final = 0.25
 _MATCH_PX: Final = 3.0
 _BLEND_PX: Final = 6.0
 _EDGE_PX: Final = 5.0
-_FEWEST: Final = 20
+_STEP_MAG: Final = 0.05
+_LAST: Final = 200
+"""Number of stars from which the error at the limit is taken."""
+_UNKNOWN_SIGMA: Final = 0.1
+_RENDERED_SHARE: Final = 0.99
+"""Share of the stars within the faintest magnitude rendered; the others are companions of brighter stars."""
+_ODDS: Final = math.log(FOUND_SHARE / (1.0 - FOUND_SHARE))
+_STEEPEST: Final = 100.0
+"""Standard deviation of the prior of the slope, 1/mag."""
+_STEPS: Final = 30
+_LEAST_WEIGHT: Final = 1e-9
 _MAD_TO_SIGMA: Final = 1.4826
 
 
@@ -50,7 +61,8 @@ def measure_photometry(
 ) -> MeasuredPhotometry:
     """Render and detect fields at random attitudes.
 
-    `zero_e` is the number of electrons in an exposure from a star of magnitude 0.
+    `zero_e` is the number of electrons in an exposure from a star of magnitude 0. The limit is rounded to some two standard
+    errors, so that most runs of a profile share a feature database.
     """
     rng = np.random.default_rng(_SEED)
     magnitudes, errors = [], []
@@ -59,7 +71,8 @@ def measure_photometry(
         true, error = _compared(frame, find(frame), zero_e)
         magnitudes.append(true)
         errors.append(error)
-    return _limit_of(np.concatenate(magnitudes), np.concatenate(errors))
+    measured = _limit_of(np.concatenate(magnitudes), np.concatenate(errors))
+    return MeasuredPhotometry(round(measured.limit / _STEP_MAG) * _STEP_MAG, measured.sigma)
 
 
 def _compared(frame: Frame, detections: Detections, zero_e: float) -> tuple[Array, Array]:
@@ -85,17 +98,30 @@ def _compared(frame: Frame, detections: Detections, zero_e: float) -> tuple[Arra
 
 
 def _limit_of(magnitude: Array, error: Array) -> MeasuredPhotometry:
-    """The faintest magnitude down to which each class holds 90 % of its stars, and the error in the last of them."""
-    edges = np.arange(np.floor(magnitude.min()), magnitude.max() + _BIN_MAG, _BIN_MAG)
-    limit, sigma = float(edges[0]), 0.1
-    for low in edges:
-        of_class = (magnitude >= low) & (magnitude < low + _BIN_MAG)
-        if np.count_nonzero(of_class) < _FEWEST:
-            continue
-        detected = error[of_class & np.isfinite(error)]
-        share = detected.size / np.count_nonzero(of_class)
-        if share < FOUND_SHARE:
-            return MeasuredPhotometry(float(low), sigma)
-        limit = float(low) + _BIN_MAG
-        sigma = float(_MAD_TO_SIGMA * np.median(np.abs(detected - np.median(detected))))
+    """The magnitude at which a logistic curve, fitted to which stars were found, has 90 %, and the error of the last above it."""
+    found = np.isfinite(error)
+    centre, slope = _fitted_curve(magnitude, found)
+    faintest = float(np.quantile(magnitude, _RENDERED_SHARE))
+    limit = min(centre - _ODDS / slope, faintest) if slope > 0.0 else faintest
+    above = np.flatnonzero(found & (magnitude <= limit))
+    last = error[above[np.argsort(magnitude[above])][-_LAST:]]
+    sigma = float(_MAD_TO_SIGMA * np.median(np.abs(last - np.median(last)))) if last.size else _UNKNOWN_SIGMA
     return MeasuredPhotometry(limit, sigma)
+
+
+def _fitted_curve(magnitude: Array, found: Mask) -> tuple[float, float]:
+    """Maximum-likelihood fit of the share found, 1/(1 + exp(slope·(m − centre))); by Newton's method.
+
+    A weak prior on the slope keeps it finite if one magnitude parts all stars found from the others.
+    """
+    middle = float(magnitude.mean())
+    design = np.column_stack([np.ones(magnitude.size), magnitude - middle])
+    curve, prior = np.zeros(2), np.diag([0.0, 1.0 / _STEEPEST**2])
+    for _ in range(_STEPS):
+        share = expit(design @ curve)
+        weight = np.maximum(share * (1.0 - share), _LEAST_WEIGHT)
+        curve += np.linalg.solve(
+            design.T @ (design * weight[:, None]) + prior, design.T @ (found - share) - prior @ curve
+        )
+    slope = -float(curve[1])
+    return middle + (float(curve[0]) / slope if slope else math.inf), slope

@@ -48,23 +48,40 @@ from starhil.emulator.sensor.sky.objects import EarthLimb, Moon, SkyObjects, Sun
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.simulation.guard import one_line
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
-from starid.arrays import Array
+from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.camera.calibration import attitude_covariance
-from starid.catalog import load_catalog
+from starid.catalog import StarCatalog, load_catalog
 from starid.catalog.aberration import aberrated
 from starid.errors import StaridError
+from starid.identification.geometric.identifier import Effort
+from starid.identification.geometric.index_choice import pixels_per_radian
+from starid.identification.geometric.pattern_index import resolved_stars
 from starid.identification.geometric.refinement import PRIOR_FREEDOM
+from starid.identification.options import GeometricOptions
+from starid.identification.predicted_stars import expected_places, solve_with_prediction
 from starid.identification.solution import Reason, Solution
 from starid.identification.star_identifier import StarIdentifier
 from starid.imaging.detection import Detections, DetectionSettings, detect
+from starid.imaging.star_windows import detect_near
 
 STARS_SENT: Final = 16
 """Number of identified stars returned to the device; the brightest ones."""
 
 DOWNLOAD_BITS: Final = 8
 """Bits per pixel of an image for download."""
+
+_TRACKED_SIGMA: Final = 3.0
+"""Detection threshold near the predicted places of stars."""
+
+_TRACKED_LIMITS: Final = 4
+"""Number of lists of stars to look for that are kept, by limiting magnitude."""
+
+_LONGEST_STILL_PX: Final = 1.0
+"""Longest trail of a star that is taken for a spot."""
+
+_MAX_FALSE_PROBABILITY: Final = Effort().max_false_probability_tracking
 
 _WARM_UP_BODIES: Final = SkyObjects(
     sun=SunGlare(0.0, 80.0),
@@ -113,6 +130,12 @@ class _Exposure:
     frame: Frame | None = None
     objects: SkyObjects = field(default_factory=SkyObjects)
 
+    def false_stars(self, xy_px: Array) -> Mask:
+        """Which positions (n, 2) are those of false stars; none if the image was not rendered."""
+        if self.frame is None or self.frame.objects is None:
+            return np.zeros(len(xy_px), dtype=np.bool_)
+        return near_any(xy_px, self.frame.objects.false_xy_px)
+
 
 class Pipeline:
     """Renderer, detector and star identifier of a run, with the state they keep between frames."""
@@ -131,6 +154,7 @@ class Pipeline:
         self.images: ImageSource | None = None
         """Source of images; None: they are rendered."""
         self._dark: DarkMap | None = None
+        self._tracked: dict[float, StarCatalog] = {}
         self._calibration = None if setup.calibration is None else np.array(setup.calibration)
         """Covariance (9, 9) of the calibrated camera's parameters; None: they are exact."""
 
@@ -219,10 +243,17 @@ class Pipeline:
         if not request.solve:
             preview = self._preview(exposure, sensor) if request.preview else None
             return FrameResult(request.index, solved=False, render_s=rendered - begin, preview=preview)
-        found = self._detect(exposure, request, sensor)
-        detected = time.perf_counter()
         identifier, current = self._identifiers.get(self._identifier_setup(request))
+        windows = self._detect_predicted(exposure, request, sensor)
+        found = self._detect(exposure, request, sensor) if windows is None else windows
+        detected = time.perf_counter()
         solution = self._solve(identifier, found, request)
+        if windows is not None and not solution.valid:
+            found = self._detect(exposure, request, sensor)
+            detected = time.perf_counter()
+            solution = self._solve(identifier, found, request)
+        if not solution.valid or _less_certain(solution, request):
+            found, solution = self._follow(exposure, request, sensor, identifier, found, solution)
         solved = time.perf_counter()
         times = (begin, rendered, detected, solved)
         result = self._frame_result(request, sensor, found, solution, identifier, times)
@@ -231,8 +262,8 @@ class Pipeline:
             seen = stars_seen(stars.xy_px[stars.visible], found.xy_px) if exposure.in_field else 0
             enough = seen >= request.settings.min_stars_matched
             result = with_bodies(result, exposure.in_field, enough_stars=enough)
-            if solution.features is not None and exposure.frame.objects is not None:
-                false = near_any(found.xy_px, exposure.frame.objects.false_xy_px)
+            if solution.features is not None:
+                false = exposure.false_stars(found.xy_px)
                 removed = list(solution.features.removed_index)
                 counts = int(np.count_nonzero(false)), int(np.count_nonzero(false[removed]))
                 result = replace(result, false_detected=counts[0], false_removed=counts[1])
@@ -240,10 +271,12 @@ class Pipeline:
             result = replace(result, preview=self._preview(exposure, sensor, found, solution))
         return result if current else replace(result, index_pending=True)
 
-    def detections(self, request: FrameRequest) -> Detections:
-        """Take the image of a request and return its detections."""
+    def detections(self, request: FrameRequest) -> tuple[Detections, Mask]:
+        """Take the image of a request and return its detections, and which of them are false stars."""
         sensor = self._sensor.with_(exposure_s=request.exposure_s, gain=request.gain)
-        return self._detect(self._expose(request), request, sensor)
+        exposure = self._expose(request)
+        found = self._detect(exposure, request, sensor)
+        return found, exposure.false_stars(found.xy_px)
 
     def identifier(self, request: FrameRequest) -> StarIdentifier:
         """Return the star identifier for the parameters of a request."""
@@ -254,11 +287,17 @@ class Pipeline:
         return self._solve(self.identifier(request), found, request)
 
     def _detect(self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel) -> Detections:
+        return detect(*self._detection(exposure, request, sensor))
+
+    def _detection(
+        self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel
+    ) -> tuple[NDArray[Any], DetectionSettings]:
+        """Return the image in which the unit detects stars, and its settings."""
         if self.images is None:
             image, known = self._without_dark(exposure.image, request), sensor.detection_settings()
         else:
             image, known = exposure.image, DetectionSettings()
-        return detect(image, detection_settings(known, request.settings))
+        return image, detection_settings(known, request.settings)
 
     def _preview(
         self,
@@ -315,13 +354,12 @@ class Pipeline:
         if request.predicted is None:
             solution = identifier.identify(xy, flux, errors, observer_velocity=request.observer_velocity)
         else:
-            windows_px = (settings.search_width / 2.0, settings.window_width / 2.0)
             solution = identifier.track(
                 xy,
                 flux,
                 np.array(request.predicted.quaternion_xyzw),
                 errors,
-                window_px=float(min(settings.tracking_margin, *windows_px)),
+                window_px=_window_px(settings),
                 observer_velocity=request.observer_velocity,
             )
         if not solution.valid or (solution.features is not None and not solution.features.refined):
@@ -341,6 +379,86 @@ class Pipeline:
             camera, self._calibration, xy[used], errors[used], offsets, PRIOR_FREEDOM
         )
         return replace(solution, covariance=covariance, sigma_px=noise_px)
+
+    def _follow(
+        self,
+        exposure: _Exposure,
+        request: FrameRequest,
+        sensor: SensorModel,
+        identifier: StarIdentifier,
+        found: Detections,
+        failed: Solution,
+    ) -> tuple[Detections, Solution]:
+        """Look for few and faint stars where a prediction expects them; return detections and solution, or those given."""
+        covariance, least = request.prediction_covariance, self._setup.tracking_stars
+        predicted = self._window_centre(request)
+        if covariance is None or least == 0 or predicted is None or self._leaves_trails(request):
+            return found, failed
+        settings, camera = request.settings, calibrated_camera(self.camera, request.settings)
+        stars = self._tracked_stars(
+            settings.limiting_magnitude + 2.5 * math.log10(settings.detection_threshold / _TRACKED_SIGMA)
+        )
+        places = self._predicted_places(predicted, request, stars)
+        if len(places) < least:
+            return found, failed
+        image, known = self._detection(exposure, request, sensor)
+        faint = replace(
+            known,
+            threshold_sigma=min(_TRACKED_SIGMA, known.threshold_sigma),
+            min_star_pixels=0,
+            psf_sigma_px=sensor.mean_psf_sigma_px,
+        )
+        seen, rivals = detect_near(image, places, _window_px(settings), faint)
+        solution = solve_with_prediction(
+            camera, stars, seen, predicted, covariance,
+            2.5 * math.log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY,
+            self._setup.tracking_error_rad, rivals=rivals, observer_velocity=request.observer_velocity, known=self._calibration,
+        )  # fmt: skip
+        if not solution.valid or solution.star_count < least:
+            return found, failed
+        rows = identifier.catalog.index_of(solution.hip).astype(np.int64)
+        return seen, replace(solution, catalog_index=rows)
+
+    def _detect_predicted(
+        self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel
+    ) -> Detections | None:
+        """Detect the brightest predicted stars in windows; None if the unit does not, or if stars leave trails."""
+        predicted = self._window_centre(request)
+        if not self._setup.tracking_windows or predicted is None or self._leaves_trails(request):
+            return None
+        settings = request.settings
+        stars = self._tracked_stars(settings.limiting_magnitude)
+        places = self._predicted_places(predicted, request, stars)
+        image, known = self._detection(exposure, request, sensor)
+        found, _ = detect_near(image, places[: settings.max_stars_matched], _window_px(settings), known)
+        return found
+
+    def _leaves_trails(self, request: FrameRequest) -> bool:
+        """Whether stars leave trails at the predicted rate: only the whole image shows how they run."""
+        rate = request.predicted_rate_rad_s or (0.0, 0.0, 0.0)
+        trail_px = float(np.linalg.norm(rate)) * request.exposure_s * max(self.camera.focal_px)
+        return trail_px > _LONGEST_STILL_PX
+
+    def _window_centre(self, request: FrameRequest) -> Attitude | None:
+        """Return the prediction if windows can be laid: not with a damaged catalogue, whose list of stars is another one."""
+        if self._setup.algorithm != "geometric" or self.images is not None or request.upsets:
+            return None
+        predicted = request.predicted
+        return None if predicted is None else Attitude(np.array(predicted.quaternion_xyzw))
+
+    def _predicted_places(self, predicted: Attitude, request: FrameRequest, stars: StarCatalog) -> Array:
+        """Return where a prediction shows stars, brightest first; pixels (m, 2)."""
+        camera = calibrated_camera(self.camera, request.settings)
+        return expected_places(camera, stars, predicted, request.observer_velocity)[1]
+
+    def _tracked_stars(self, limiting_magnitude: float) -> StarCatalog:
+        """Return the stars to a limit, as the camera resolves them."""
+        if limiting_magnitude not in self._tracked:
+            blend_rad = GeometricOptions().blend_px / pixels_per_radian(self.camera)
+            if len(self._tracked) >= _TRACKED_LIMITS:
+                self._tracked.clear()
+            self._tracked[limiting_magnitude] = resolved_stars(self.catalog, limiting_magnitude, blend_rad)
+        return self._tracked[limiting_magnitude]
 
     def _identifier_setup(self, request: FrameRequest | IndexRequest) -> StarIdentifierSetup:
         """Return the setup of the star identifier for the parameters and the calibrated camera."""
@@ -453,6 +571,17 @@ def _offsets(identifier: StarIdentifier, solution: Solution, xy: Array, request:
 def _camera_of(solution: Solution, identifier: StarIdentifier) -> Camera:
     """Return the camera with which an attitude was found: the calibrated one, or that one refined by the solution."""
     return identifier.camera if solution.camera is None else solution.camera
+
+
+def _less_certain(solution: Solution, request: FrameRequest) -> bool:
+    """Whether a valid solution is less certain than the prediction, about some axis."""
+    expected = request.prediction_covariance
+    return expected is not None and bool(np.any(np.diag(solution.covariance) > np.diag(expected)))
+
+
+def _window_px(settings: SolverSettings) -> float:
+    """Return the largest distance of a tracked star from its prediction, pixels."""
+    return float(min(settings.tracking_margin, settings.search_width / 2.0, settings.window_width / 2.0))
 
 
 def detection_settings(known: DetectionSettings, settings: SolverSettings) -> DetectionSettings:

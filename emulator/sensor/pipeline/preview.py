@@ -134,12 +134,15 @@ def _features(report: FeatureReport | None) -> dict[str, Any] | None:
         "triggered": report.triggered,
         "refined": report.refined,
         "error_psi": None if math.isnan(report.error_psi) else round(report.error_psi, 3),
+        "cell": report.cell,
         "weights": report.weights,
         "observed": [round(value, 2) for value in report.observed],
         "of_cell": [round(value, 2) for value in report.of_cell],
         "region_deg": round(report.region_deg, 2),
         "region_at_deg": [round(value, 3) for value in report.region_at_deg],
         "removed": list(report.removed_index),
+        "rotation_deg": round(report.rotation_deg, 3),
+        "translation_deg": round(report.translation_deg, 3),
     }
 
 

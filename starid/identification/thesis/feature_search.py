@@ -173,7 +173,7 @@ class FeatureSearch:
 
     def answer(self, features: FeatureVector) -> FeatureAnswer:
         """Algorithm 1: the nearest cell of the whole database, LASSO, boresight and roll."""
-        return self._answer(self.lost_in_space.solve(features), features)
+        return self.answer_of(self.lost_in_space.solve(features), features)
 
     def answer_in_region(
         self, features: FeatureVector, centre: Attitude, side_deg: float
@@ -184,9 +184,10 @@ class FeatureSearch:
         cell, distance, _ = lsi.nearest_in_region(observation, middle.ra_deg, middle.dec_deg, side_deg)
         if cell < 0:
             return None
-        return self._answer(lsi.estimate(observation, cell, distance), features)
+        return self.answer_of(lsi.estimate(observation, cell, distance), features)
 
-    def _answer(self, solution: LsiSolution, features: FeatureVector) -> FeatureAnswer:
+    def answer_of(self, solution: LsiSolution, features: FeatureVector) -> FeatureAnswer:
+        """Boresight and roll of a solution: the pointers of features and estimate are laid on each other."""
         estimate = solution.mse
         x, y = math.cos(features.theta_rad), math.sin(features.theta_rad)
         across = np.cross(estimate.boresight, estimate.pointer)

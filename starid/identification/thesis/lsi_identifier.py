@@ -33,7 +33,7 @@ from starid.identification.geometric.pattern_index import resolved_stars
 from starid.identification.geometric.verified import VerifiedIdentifier
 from starid.identification.options import REGION_DEG, LsiOptions
 from starid.identification.single_camera import CheckedDetections
-from starid.identification.solution import FeatureReport, Reason, Solution
+from starid.identification.solution import FeatureReport, Reason, Search, Solution
 from starid.identification.thesis.database import DatabaseParameters, sky_of
 from starid.identification.thesis.database_choice import given_database, obtain_database
 from starid.identification.thesis.feature_error import FeatureErrors, Photometry
@@ -299,16 +299,19 @@ class LsiIdentifier(VerifiedIdentifier):
             answers = (*first, self.search.answer(features))
             best = min(answers, key=lambda answer: answer.error_psi)
             self.last_report = LsiReport(answers[-1].attitude, 0, 0, zero_point)
-            return self.by_features_alone(best)
+            return self.by_features_alone(best, "lsi" if best is answers[-1] else "rsi")
         self.last_report = LsiReport(None, 0, 0, math.nan)
         return Solution.invalid(Reason.TOO_FEW_STARS)
 
-    def by_features_alone(self, answer: FeatureAnswer, wrong: float | None = None) -> Solution:
+    def by_features_alone(
+        self, answer: FeatureAnswer, search: Search, wrong: float | None = None
+    ) -> Solution:
         """The solution of the first stage; invalid if ε_ψ > K·τ.
 
-        `wrong` is the probability that it is at another place of the sky; by default that of the whole database.
+        `search` says where the answer was found. `wrong` is the probability that it is at another place of the sky; by
+        default that of the whole database.
         """
-        report = report_of(answer, "lsi")
+        report = report_of(answer, search)
         psi = answer.error_psi
         if self.errors is None or psi > self.options.largest_error_psi:
             return dataclasses.replace(Solution.invalid(Reason.RESIDUAL), features=report)
@@ -389,7 +392,7 @@ class LsiIdentifier(VerifiedIdentifier):
             self._zero_point = float(np.median(found))
 
 
-def report_of(answer: FeatureAnswer | None, search: Any, **others: Any) -> FeatureReport:
+def report_of(answer: FeatureAnswer | None, search: Search, **others: Any) -> FeatureReport:
     """What the first stage did, for `Solution.features`."""
     if answer is None:
         return FeatureReport(search, **others)

@@ -3,7 +3,8 @@
 The false-star filter (FSF) compares each image with those before it. The motion of its true stars (CME) carries the last
 attitude to the present image; the cells of a region around it are searched for the features of the true
 stars. If ε_ψ > τ, the whole database is searched as well, and the answer with the smaller ε_ψ is kept; one with
-ε_ψ > K·τ is invalid. With refinement, an answer that is not verified counts as one with ε_ψ > τ.
+ε_ψ > K·τ is invalid. While the answer kept has ε_ψ > τ, only the whole database is searched (section 6.3.2). With refinement,
+a verified answer counts as one with ε_ψ ≤ τ, and any other as one above.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ class RsiStatistics:
     invalid
         Number of frames without an answer.
     region_sum_deg
-        Sum of the sides of the regions; divide by `frames` for the mean.
+        Sum of the sides of the regions, of which there are `in_region` + `triggers`.
     """
 
     frames: int = 0
@@ -153,6 +154,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         self._before: ObservedFrame | None = None
         self._last: Attitude | None = None
         self._wrong = 1.0
+        self._exceeded = False
         self.statistics = RsiStatistics()
 
     @property
@@ -172,13 +174,14 @@ class RsiIdentifier(SingleCameraIdentifier):
         """Forget previous frames, the learned zero point and the statistics."""
         self.lsi.reset()
         self._before = self._last = None
+        self._exceeded = False
         if self._filter is not None:
             self._filter.reset()
         self.statistics = RsiStatistics()
 
     def _identify(self, measured: CheckedDetections) -> Solution:
         """Find the attitude in the whole database, from the stars that the filter keeps."""
-        known = self._preprocess(measured.xy, measured.flux)
+        known = self.preprocess(measured.xy, measured.flux)
         solution = self._whole_sky(measured, known)
         self._remember(solution)
         return dataclasses.replace(solution, features=known.add_to(solution.features))
@@ -200,7 +203,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         The centre of the region is the last attitude, carried by the measured motion. Only without it, as after a
         missing image, is it the prediction given; the region is then at least as wide as the window.
         """
-        known = self._preprocess(measured.xy, measured.flux)
+        known = self.preprocess(measured.xy, measured.flux)
         side = known.side_deg
         if self._last is not None and known.rotation is not None:
             centre = Attitude.from_matrix(known.rotation @ self._last.matrix)
@@ -209,20 +212,30 @@ class RsiIdentifier(SingleCameraIdentifier):
             if window_px is not None:
                 side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
         side = min(side, self.lsi.database.parameters.fov_deg)
-        field, answers = self._in_region(measured, known, centre, side)
-        solution = None if field is None else self._accepted(measured, known, field, answers)
-        triggered = solution is None
-        if solution is None:
-            solution = self._whole_sky(measured, known, answers[:1])
-        self._count(solution, side, triggered=triggered)
+        if self._exceeded:
+            solution = self._whole_sky(measured, known)
+            report = known.add_to(solution.features)
+        else:
+            field, answers = self._in_region(measured, known, centre, side)
+            local = None if field is None else self._accepted(measured, known, field, answers)
+            solution = self._whole_sky(measured, known, answers[:1]) if local is None else local
+            report = known.add_to(
+                solution.features,
+                triggered=local is None,
+                region_deg=side,
+                region_at_deg=(centre.ra_deg, centre.dec_deg),
+            )
+        self._count(solution, report)
         self._remember(solution)
-        place = (centre.ra_deg, centre.dec_deg)
-        report = known.add_to(solution.features, triggered=triggered, region_deg=side, region_at_deg=place)
         return dataclasses.replace(solution, features=report)
 
     def _remember(self, solution: Solution) -> None:
         self._last = solution.attitude if solution.valid else None
         self._wrong = solution.probability_false
+        features = solution.features
+        self._exceeded = features is None or not (
+            solution.valid and (features.refined or features.error_psi <= self._settings.tau)
+        )
 
     def _place_wrong(self, answer: FeatureAnswer, known: Preprocessed) -> float:
         """Probability that the region is at another place of the sky, by Bayes' rule from the last image's.
@@ -237,17 +250,17 @@ class RsiIdentifier(SingleCameraIdentifier):
         odds *= float(errors.ratio[errors.row(answer.error_psi)]) ** new
         return max(float(odds / (1.0 + odds)), _LEAST_WRONG)
 
-    def _count(self, solution: Solution, side_deg: float, *, triggered: bool) -> None:
+    def _count(self, solution: Solution, report: FeatureReport) -> None:
         old = self.statistics
         self.statistics = RsiStatistics(
             old.frames + 1,
-            old.in_region + (not triggered),
-            old.triggers + triggered,
+            old.in_region + (report.region_deg > 0.0 and not report.triggered),
+            old.triggers + report.triggered,
             old.invalid + (not solution.valid),
-            old.region_sum_deg + side_deg,
+            old.region_sum_deg + report.region_deg,
         )
 
-    def _preprocess(self, xy: Array, flux: Array) -> Preprocessed:
+    def preprocess(self, xy: Array, flux: Array) -> Preprocessed:
         """FSF and CME, lines 6 to 8 of algorithm 3."""
         unknown = Preprocessed(
             np.ones(flux.size, dtype=np.bool_), None, 0.0, 0.0, self._settings.gamma_min_deg
@@ -321,8 +334,8 @@ class RsiIdentifier(SingleCameraIdentifier):
             if answer.error_psi > self._settings.tau:
                 continue
             if not self.options.refinement:
-                found = self.lsi.by_features_alone(answer, self._place_wrong(answer, known))
-                return dataclasses.replace(found, mode="tracking", features=report_of(answer, "rsi"))
+                found = self.lsi.by_features_alone(answer, "rsi", self._place_wrong(answer, known))
+                return dataclasses.replace(found, mode="tracking")
             for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
                 if attitude is None:
                     continue

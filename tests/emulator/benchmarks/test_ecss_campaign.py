@@ -5,28 +5,39 @@ from __future__ import annotations
 import csv
 import json
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from starhil.emulator.benchmarks.ecss_campaign import INFLUENCES, EcssDevice, EcssPlan, run_part
-from starhil.emulator.benchmarks.ecss_report import interval
+from starhil.emulator.benchmarks.ecss_report import Stated, figure_names, interval
+from starhil.emulator.benchmarks.ecss_requirements import read_requirements
 from starhil.emulator.cli.app import build_app
+from starhil.emulator.errors import EmulatorError
 
 SMALL = ["camera.width=320", "camera.height=320", "camera.fov_deg=30.0"]
 DRIFT = ["sensor.boresight_drift_x=2.0", "sensor.boresight_drift_z=6.0", "thermal.swing_c=10.0"]
 OPTIONS = ["--fields", "12", "--rest-frames", "20", "--frames", "5", "--seed", "4", "--json"]
 
 
-def campaign(folder, *settings: str) -> dict:
+def campaign(folder, *settings: str, options: tuple = (), status: int = 0) -> dict:
     chosen = [word for setting in (*SMALL, *settings) for word in ("--set", setting)]
-    result = CliRunner().invoke(
-        build_app(), ["campaign", "--ecss", "--profile", PROFILE, *OPTIONS, *chosen, "-o", str(folder)]
-    )
-    assert result.exit_code == 0, result.output
+    words = ["campaign", "--ecss", "--profile", PROFILE, *OPTIONS, *options, *chosen, "-o", str(folder)]
+    result = CliRunner().invoke(build_app(), words)
+    assert result.exit_code == status, result.output
     return json.loads(result.stdout)
 
 
 PROFILE = "ideal"
+LIMITS = """
+requirement = [
+    { id = "R1", figure = "thermo_elastic.x", max = 30.0, text = "drift along the orbit" },
+    { id = "R2", figure = "thermo_elastic.z", max = 30.0 },
+    { id = "R3", figure = "rest.correct", min = 99.0 },
+    { id = "R4", figure = "rest.correct", min = 50.0 },
+]
+"""
+"""Of 20 correct images of 20, the 95 % interval of the share ends at 83 %."""
 
 
 def test_an_injected_drift_is_found_and_the_campaign_is_resumed(tmp_path):
@@ -60,8 +71,24 @@ def test_an_injected_drift_is_found_and_the_campaign_is_resumed(tmp_path):
 
     kept = {file: file.stat().st_mtime_ns for file in (tmp_path / "parts").glob("*.npz")}
     next(file for file in kept if file.stem.startswith("rest")).unlink()
-    again = campaign(tmp_path, *DRIFT)
+    limits = tmp_path / "limits.toml"
+    limits.write_text(LIMITS, encoding="utf-8")
+    again = campaign(tmp_path, *DRIFT, options=("--requirements", str(limits)), status=1)
     assert again["errors_arcsec"] == errors
+    verdicts = {"R1": "met", "R2": "not met", "R3": "not shown", "R4": "met"}
+    assert again["requirements"] == verdicts
+    report = (tmp_path / "report.md").read_text(encoding="utf-8")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    for text in (report, page):
+        assert "SHA-256" in text
+        assert "--requirements" in text
+        for verdict in verdicts.values():
+            assert verdict in text
+    assert page.count("data:image/png;base64,") == 2
+    printed = (tmp_path / "report.pdf").read_bytes()
+    assert printed.startswith(b"%PDF-")
+    assert printed.count(b"/Subtype /Image") == 2
+    assert printed.count(b"/Type /Page\n") >= 3
     unchanged = [file for file in kept if file.stat().st_mtime_ns == kept[file]]
     assert len(unchanged) == len(kept) - 1
 
@@ -94,3 +121,29 @@ def test_ecss_stands_alone_and_is_asked_for():
     assert runner.invoke(app, ["campaign", "--ecss", "lost-in-space", "--frames", "1"]).exit_code == 2
     wrong = runner.invoke(app, ["campaign", "--ecss", "--confidence", "99.7"])
     assert "0.997" in str(wrong.exception or wrong.output)
+
+
+def test_stated_uncertainties_get_a_verdict():
+    rng = np.random.default_rng(3)
+    normal, stated = rng.normal(size=(2000, 2)), np.ones(2000)
+    assert Stated.of("across", normal, stated).verdict == "consistent with the errors"
+    assert Stated.of("across", normal, 0.7 * stated).verdict.startswith("**too small**: 96")
+    assert Stated.of("across", normal, 1.3 * stated).verdict.startswith("larger than the errors")
+
+
+def test_requirements_name_figures_of_the_report(tmp_path):
+    file = tmp_path / "limits.toml"
+    file.write_text(
+        '[[requirement]]\nid = "A"\nfigure = "total.acros"\nmax = 1\n'
+        '[[requirement]]\nid = "B"\nfigure = "rate.0.3.corect"\nmin = 1\n',
+        encoding="utf-8",
+    )
+    with pytest.raises(EmulatorError) as error:
+        read_requirements(file, figure_names())
+    assert "A: no figure 'total.acros'; did you mean total.across" in str(error.value)
+    assert "B: no figure 'rate.0.3.corect'; did you mean rate.0.3.correct" in str(error.value)
+    file.write_text(
+        '[[requirement]]\nid = "A"\nfigure = "total.across"\nmax = 1\nmin = 0\n', encoding="utf-8"
+    )
+    with pytest.raises(EmulatorError, match=r"limits\.toml: requirement\.A: .*give either min or max"):
+        read_requirements(file, figure_names())

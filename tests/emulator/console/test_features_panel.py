@@ -43,7 +43,11 @@ def test_features_region_and_removed_detections_are_shown(page):  # noqa: F811
     )
     pairs = [value for pair in zip(shown["observed"], shown["of_cell"], strict=True) for value in pair]
     assert widths == pytest.approx([min(max(value, 0.0), 100.0) for value in pairs], abs=0.01)
-    assert "RSI, 2.0°" in page.locator("#features p").text_content()
+    text = page.locator("#features p").text_content()
+    assert "RSI, 2.0°" in text
+    assert f"cell {shown['cell'] + 1} · {shown['weights']} weights" in text
+    assert shown["translation_deg"] > 0.1  # 0.3 degrees per second, two images per second
+    assert f"moved {shown['translation_deg']:.2f}°, turned " in text
     assert shown["region_deg"] == pytest.approx(2.0, abs=0.1)
     crossed = page.evaluate(
         """() => {

@@ -168,7 +168,7 @@ def test_a_profile_may_give_the_device_another_idea_of_its_camera(make_bench):
 
 
 def test_the_camera_of_a_profile_and_the_defaults_of_the_model_are_the_camera_of_starid():
-    assert Camera.from_dict(Profile().camera.values()) == DEFAULT_CAMERA
+    assert Camera.from_dict(Profile().camera_values) == DEFAULT_CAMERA
     defaults = {name: item.default for name, item in device_model().parameters.items()}
     constants = camera_constants(DEFAULT_CAMERA.to_dict())
     assert {name: defaults[name] for name in constants} == pytest.approx(constants, rel=F32)

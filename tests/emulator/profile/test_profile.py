@@ -40,7 +40,7 @@ def test_every_profile_of_the_product_is_valid(name):
 
 def test_default_profile_is_of_the_class_of_the_first_cubestar():
     profile = load_profile()
-    camera = Camera.from_dict(profile.camera.values())
+    camera = Camera.from_dict(profile.camera_values)
     assert (profile.name, camera.width, camera.height) == ("cubestar", 937, 937)
     assert camera.fov_deg == pytest.approx(42.0, abs=0.001)
     assert profile.parameters["update_rate"] == 1.0
@@ -84,14 +84,29 @@ def test_a_calibrated_camera_takes_the_place_of_the_field_of_view(tmp_path):
         "[camera]\nfocal_px = [1201.0, 1202.0]\ncentre_px = [460.0, 470.0]\n[calibration]\nstars = 400\n",
         "camera.toml",
     )
-    camera = load_profile(write(tmp_path, 'extends = "camera.toml"\n')).camera
-    assert camera.values()["focal_px"] == [1201.0, 1202.0]
+    profile = load_profile(write(tmp_path, 'extends = "camera.toml"\n'))
+    assert profile.camera_values["focal_px"] == [1201.0, 1202.0]
     both = write(
         tmp_path, 'extends = "cubestar"\n[camera]\nfocal_px = [1201.0, 1202.0]\ncentre_px = [460.0, 470.0]\n'
     )
-    assert "fov_deg" not in load_profile(both).camera.values()
+    assert "fov_deg" not in load_profile(both).camera_values
     back = write(tmp_path, f'extends = "{both}"\n[camera]\nfov_deg = 30.0\n', "back.toml")
-    assert "focal_px" not in load_profile(back).camera.values()
+    assert "focal_px" not in load_profile(back).camera_values
+
+
+def test_a_focal_length_in_millimetres_is_one_of_pixels(tmp_path):
+    lens = 'extends = "ideal"\n[camera]\nfocal_mm = 16.0\ncentre_px = [460.0, 470.0]\n'
+    profile = load_profile(write(tmp_path, f"{lens}[sensor]\npixel_um = 5.5\n"))
+    focal_px = 16.0 / 0.0055
+    assert profile.camera_values["focal_px"] == pytest.approx([focal_px, focal_px])
+    assert Camera.from_dict(profile.camera_values).fov_deg == pytest.approx(
+        math.degrees(math.atan(460.5 / focal_px) + math.atan(476.5 / focal_px))
+    )
+    again = load_profile("ideal", ["camera.focal_mm=16", "sensor.pixel_um=5.5", "camera.fov_deg=30"])
+    assert "focal_mm" not in again.camera_values
+    assert refusal(write(tmp_path, lens)).endswith(
+        "camera.focal_mm: needs the width of a pixel: give sensor.pixel_um"
+    )
 
 
 def test_errors_of_the_calibration_belong_to_the_camera(tmp_path):
@@ -174,8 +189,8 @@ def test_a_profile_s_camera_is_known_exactly_by_default(tmp_path):
     corrected = load_profile(write(tmp_path, f"{mine}[parameters]\nk1 = -0.14\n")).parameters
     assert {name: corrected[name] for name in corrected.keys() & CALIBRATION} == {"k1": -0.14}
     typed = load_profile("cubestar", ["parameters.k1=-0.14", "camera.fov_deg=20"])
-    assert typed.camera.values()["fov_deg"] == 20.0
-    assert "focal_px" not in typed.camera.values()
+    assert typed.camera_values["fov_deg"] == 20.0
+    assert "focal_px" not in typed.camera_values
     assert {name: typed.parameters[name] for name in typed.parameters.keys() & CALIBRATION} == {"k1": -0.14}
 
 
@@ -424,6 +439,6 @@ def test_cubestar_2013_has_the_field_and_the_catalogue_that_its_maker_published(
     ]
     assert fields == pytest.approx([50.0, 26.0], abs=0.1)
     setup = StarIdentifierSetup(
-        "geometric", Camera.from_dict(camera.values()), 1.0, (("limiting_magnitude", limit),)
+        "geometric", Camera.from_dict(profile.camera_values), 1.0, (("limiting_magnitude", limit),)
     )
     assert len(setup.make(load_catalog(epoch=profile.epoch)).stars) == pytest.approx(410, abs=5)

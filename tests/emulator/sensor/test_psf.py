@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
+from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.psf import add_spots, path_rule
+from starhil.emulator.sensor.renderer import Renderer
+from starid.camera import Camera
+from starid.catalog import load_catalog
 
 SIZE = 64
 
@@ -75,3 +79,35 @@ def test_a_dead_pixel_gets_no_light() -> None:
     add_spots(image, sensitivity, spot, np.array([1000.0]), np.array([[0.8, 0.8]]), nodes, weights)
     assert image[30, 30] == 0.0
     assert image[30, 31] > 50.0
+
+
+def test_a_spot_off_the_axis_is_round_and_grows_with_the_square_of_its_distance() -> None:
+    """A defocus is as large in every direction: 1.2 px grow by a fifth at the edge, and by two fifths in the corner."""
+    size, growth, base = 201, 0.2, 1.2
+    camera = Camera.from_fov(20.0, width=size, height=size)
+    sensor = SensorModel(psf_sigma_px=base, psf_growth=growth, prnu=0.0, dead_pixels=0)
+    renderer = Renderer(camera, load_catalog().brighter_than(0.0), sensor)
+    for place in ([100.0, 100.0], [187.0, 100.0], [100.0, 13.0], [180.0, 20.0]):
+        mean = np.zeros((size, size), dtype=np.float32)
+        renderer._add_light(mean, np.array([[*place, 0.0, 0.0, 0.0, 0.0]]), np.array([1e6]))
+        rows, columns = np.mgrid[0:size, 0:size]
+        spread = [
+            ((axis - at) ** 2 * mean).sum() / mean.sum()
+            for axis, at in zip((columns, rows), place, strict=True)
+        ]
+        off = (np.array(place) + 0.5 - size / 2.0) / (size / 2.0)
+        expected = (base * (1.0 + growth * (off @ off))) ** 2 + 1.0 / 12.0
+        assert spread == pytest.approx([expected, expected], rel=2e-3)
+
+
+@pytest.mark.parametrize(("power", "edge", "corner"), [(0, 0.0, 0.0), (1, 0.0747, 0.140), (4, 0.299, 0.559)])
+def test_light_off_the_axis_falls_with_a_power_of_the_cosine(power: int, edge: float, corner: float) -> None:
+    """Magnitudes at 21° (the edge of a field of 42°) and atan(√2 tan 21°), its corner: -2.5 n log10 cos."""
+    camera = Camera.from_fov(42.0, width=301, height=301)
+    sensor = SensorModel(vignetting=power, prnu=0.0, dead_pixels=0)
+    sensitivity = Renderer(camera, load_catalog().brighter_than(0.0), sensor)._pattern.sensitivity
+    for place, loss in (((300, 150), edge), ((300, 300), corner)):
+        x, y = place
+        assert -2.5 * np.log10(sensitivity[y, x] / sensitivity[150, 150]) == pytest.approx(
+            loss, abs=0.012 * max(loss, 1e-6) + 1e-6
+        )

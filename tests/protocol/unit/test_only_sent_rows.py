@@ -36,6 +36,11 @@ def errors(folder: Path, text: str) -> list[str]:
     return [line.removeprefix(f"{unit}/unit.toml: ") for line in found]
 
 
+@pytest.mark.parametrize("text", [packets("u8"), packets("u16"), STREAM], ids=["u8", "u16", "stream"])
+def test_a_definition_that_passes_starts(tmp_path: Path, text: str) -> None:
+    assert errors(tmp_path / "unit", text) == []
+
+
 @pytest.mark.parametrize("length", ["u8", "u16"])
 def test_space_packets_pass_as_they_run(tmp_path: Path, length: str) -> None:
     unit = written(tmp_path / "unit", packets(length))

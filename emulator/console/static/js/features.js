@@ -33,7 +33,11 @@ export class Features {
     });
     const search = known.search === "rsi" ? `RSI, ${fixed(known.region_deg, 1)}°` : known.triggered ? "RSI, then LSI" : "LSI";
     const psi = known.error_psi === null ? "too few stars" : `ε_ψ ${fixed(known.error_psi, 2)}`;
-    setText(this.text, [search, psi, `${known.weights} weights`, `${known.removed.length} removed`, ...(known.refined ? ["refined"] : [])].join(" · "));
+    const cell = known.cell < 0 ? [] : [`cell ${known.cell + 1}`, `${known.weights} weights`];
+    const moved = known.translation_deg || known.rotation_deg;
+    const motion = moved ? [`moved ${fixed(known.translation_deg, 2)}°, turned ${fixed(known.rotation_deg, 2)}°`] : [];
+    const facts = [search, psi, ...cell, `${known.removed.length} removed`, ...motion, ...(known.refined ? ["refined"] : [])];
+    setText(this.text, facts.join(" · "));
   }
 }
 

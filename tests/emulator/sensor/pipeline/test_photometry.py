@@ -18,7 +18,7 @@ from starid.attitude import Attitude, propagate
 @pytest.mark.parametrize(("profile", "low", "high"), [("cubestar", 3.25, 3.75), ("ideal", 5.5, 6.0)])
 def test_the_features_stop_where_the_detector_does(profile, low, high):
     device = EcssDevice(EcssPlan(profile, ("run.algorithm=lsi",), 3))
-    request = next(iter(Comparison(AlgorithmPlan(profile, 1, 3))._images(Scene(0.0))))[0]
+    request = next(iter(Comparison(AlgorithmPlan(profile, 1, 3))._images(Scene(0.0)))).request
     lsi = device.pipeline.identifier(request)
     assert low <= lsi.options.detected_limit <= high
     assert lsi.database.parameters.kappa <= lsi.options.detected_limit
@@ -27,14 +27,45 @@ def test_the_features_stop_where_the_detector_does(profile, low, high):
     assert lsi.options.colour_term == sensor.colour_term
 
 
+def stars_of_a_detector(rng, count, half=4.2, slope=6.0, sigma=0.07):
+    """Magnitudes of stars, three times as many per magnitude, and the errors of those found; NaN for the others."""
+    magnitude = 2.0 + np.log1p(rng.uniform(size=count) * (3.0**4 - 1.0)) / math.log(3.0)
+    found = rng.uniform(size=count) < 1.0 / (1.0 + np.exp(slope * (magnitude - half)))
+    return magnitude, np.where(found, rng.normal(0.0, sigma, count), np.nan)
+
+
+NINETY = 4.2 - math.log(9.0) / 6.0
+
+
 def test_the_limit_is_where_ninety_percent_are_found():
-    rng = np.random.default_rng(6)
-    magnitude = rng.uniform(0.0, 7.0, 20_000)
-    found = rng.uniform(size=magnitude.size) < 1.0 / (1.0 + np.exp(12.0 * (magnitude - 4.2)))
-    error = np.where(found, rng.normal(0.0, 0.07, magnitude.size), np.nan)
-    photometry = _limit_of(magnitude, error)
-    assert photometry.limit == pytest.approx(4.0, abs=0.25)
-    assert photometry.sigma == pytest.approx(0.07, rel=0.15)
+    photometry = _limit_of(*stars_of_a_detector(np.random.default_rng(6), 20_000))
+    assert photometry.limit == pytest.approx(NINETY, abs=4.0 * limit_error(20_000))
+    assert photometry.sigma == pytest.approx(0.07, rel=4.0 * 1.17 / math.sqrt(200.0))  # of a median of 200
+
+
+def limit_error(count):
+    """Standard error of the limit by the information in as many stars (Cramér-Rao)."""
+    magnitude, _ = stars_of_a_detector(np.random.default_rng(1), 100_000)
+    share = 1.0 / (1.0 + np.exp(6.0 * (magnitude - 4.2)))
+    design = np.column_stack([np.ones(magnitude.size), magnitude])
+    information = design.T @ (design * (share * (1.0 - share))[:, None]) * (count / magnitude.size)
+    gradient = np.array([1.0, NINETY]) / 6.0  # of the magnitude at which the logit is that of ninety percent
+    return float(np.sqrt(gradient @ np.linalg.inv(information) @ gradient))
+
+
+def test_the_limit_varies_no_more_from_one_start_to_the_next_than_the_stars_seen_make_it():
+    rng = np.random.default_rng(7)
+    limits = [_limit_of(*stars_of_a_detector(rng, 2000)).limit for _ in range(100)]
+    assert np.std(limits) <= limit_error(2000) * (1.0 + 4.0 / math.sqrt(200.0))
+    assert np.mean(limits) == pytest.approx(NINETY, abs=0.5 * limit_error(2000))
+
+
+def test_the_limit_of_a_detector_that_finds_all_stars_is_that_of_the_stars():
+    magnitude, error = stars_of_a_detector(np.random.default_rng(8), 1000, half=20.0)
+    assert _limit_of(magnitude, error).limit == pytest.approx(magnitude.max(), abs=0.02)
+    error[np.argmin(magnitude)] = np.nan  # a bright double
+    magnitude[0] = 9.7  # a companion, which is drawn with its star
+    assert _limit_of(magnitude, error).limit == pytest.approx(np.sort(magnitude)[-2], abs=0.02)
 
 
 def test_false_stars_are_counted_among_the_detections_and_among_those_removed():

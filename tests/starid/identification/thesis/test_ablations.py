@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 
 import numpy as np
 import pytest
 from scipy.stats import binom, fisher_exact, wilcoxon
 
-from starid.attitude import Attitude, propagate, random_attitude
+from starid.attitude import propagate, random_attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.catalog import load_catalog
-from starid.identification.thesis.feature_search import FeatureSearch
+from starid.errors import StaridError
+from starid.identification.thesis.ablations import checked_part, without
 from starid.identification.thesis.lsi_identifier import LsiIdentifier
 from starid.identification.thesis.rsi_identifier import RsiIdentifier
 
@@ -34,7 +34,7 @@ IMAGES = 90
 FEATURES_ALONE = 0.99
 """Share of the images of `ideal` for which features alone give an attitude, right or wrong, of 200 images."""
 STATED_SQUARES = (0.7, 1.0)
-"""Squared errors of features alone divided by the stated ones, lost in space, as docs/identification.md states them."""
+"""Squared errors of features alone divided by the stated ones, lost in space, as docs/identification.md states them for wide fields."""
 RIGHT_DEG = 1.5
 WRONG_DEG = 0.1
 
@@ -107,63 +107,30 @@ def costs(intact, ablated):
     return ablated <= (1.0 - COST) * intact and fisher_exact(table, alternative="greater").pvalue < CHANCE
 
 
-def of_another_image(method):
-    """The method of a search with the stars of the image before, so that features do not belong to the image."""
-    last = []
-
-    def with_last(self, field):
-        last.append(field)
-        return method(self, last[-2] if len(last) > 2 else field)
-
-    return with_last
-
-
-def test_features_of_another_image_find_nothing(monkeypatch):
+def test_features_of_another_image_find_nothing():
     intact = valid_count(lost_in_space())
     assert intact >= least(LOST_IN_SPACE)
-    for name in ("features", "doubtful_features"):
-        monkeypatch.setattr(FeatureSearch, name, of_another_image(getattr(FeatureSearch, name)))
-    assert costs(
-        intact, valid_count(lost_in_space())
-    )  # the neighbours of any features cover a part of the sky
+    with without("features"):
+        ablated = valid_count(lost_in_space())
+    assert costs(intact, ablated)  # the neighbours of any features cover a part of the sky
 
 
-def test_features_of_another_part_of_the_sky_leave_the_region_useless(monkeypatch):
+def test_features_of_another_image_leave_the_region_useless():
     valid, in_region = slew(0.5)
     assert in_region >= least(FROM_REGION)
-    elsewhere = identifier(LsiIdentifier, True).search.field_stars(  # noqa: FBT003
-        *image(np.random.default_rng(5), Attitude.from_radec_roll(266.0, -29.0, 0.0)), ZERO_POINT
-    )
-    features, doubtful = FeatureSearch.features, FeatureSearch.doubtful_features
-    monkeypatch.setattr(FeatureSearch, "features", lambda self, _field: features(self, elsewhere))
-    monkeypatch.setattr(FeatureSearch, "doubtful_features", lambda self, _field: doubtful(self, elsewhere))
-    ablated, ablated_in_region = slew(0.5)
+    with without("features"):
+        ablated, ablated_in_region = slew(0.5)
     assert costs(in_region, ablated_in_region)
     assert costs(valid_count(valid), valid_count(ablated))
 
 
-def test_shuffled_weights_of_the_lasso_cost_accuracy(monkeypatch):
+def test_shuffled_weights_of_the_lasso_cost_accuracy():
     ordered = lost_in_space(refinement=False, images=200)
     right = ordered < RIGHT_DEG
-    answer = FeatureSearch._answer
-    rng = np.random.default_rng(7)
-
-    def shuffled(self, solution, features):
-        weights = solution.weights[:, rng.permutation(9)]
-        places = np.radians([self.database.grid.centre(cell) for cell in solution.cells.tolist()])
-        ra, dec = places.T
-        directions = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-        results = solution.results.copy()
-        results[:, 6:9] = weights @ directions
-        results[:, 6:9] /= np.linalg.norm(results[:, 6:9], axis=1)[:, None]
-        results[:, 9:12] -= results[:, 6:9] * np.sum(results[:, 6:9] * results[:, 9:12], axis=1)[:, None]
-        results[:, 9:12] /= np.linalg.norm(results[:, 9:12], axis=1)[:, None]
-        return answer(self, dataclasses.replace(solution, weights=weights, results=results), features)
-
-    monkeypatch.setattr(FeatureSearch, "_answer", shuffled)
-    ablated = lost_in_space(refinement=False, images=200)
-    assert np.median(ablated[right]) >= np.median(ordered[right]) / (1.0 - COST)
-    assert wilcoxon(ordered[right], ablated[right], alternative="less").pvalue < CHANCE
+    with without("weights"):
+        shuffled = lost_in_space(refinement=False, images=200)
+    assert np.median(shuffled[right]) >= np.median(ordered[right]) / (1.0 - COST)
+    assert wilcoxon(ordered[right], shuffled[right], alternative="less").pvalue < CHANCE
 
 
 def test_without_the_filter_twenty_false_stars_cost_attitudes():
@@ -174,18 +141,20 @@ def test_without_the_filter_twenty_false_stars_cost_attitudes():
     assert costs(in_region, unfiltered_in_region)
 
 
-def test_a_reversed_motion_loses_the_region(monkeypatch):
+@pytest.mark.parametrize("part", ["motion", "region"])
+def test_without_motion_or_region_nothing_is_found_in_the_region(part):
     _, in_region = slew(2.0)
     assert in_region >= least(FROM_REGION)
-    preprocess = RsiIdentifier._preprocess
-
-    def reversed_motion(self, xy, flux):
-        known = preprocess(self, xy, flux)
-        return known if known.rotation is None else dataclasses.replace(known, rotation=known.rotation.T)
-
-    monkeypatch.setattr(RsiIdentifier, "_preprocess", reversed_motion)
-    _, ablated = slew(2.0)
+    with without(part):
+        _, ablated = slew(2.0)
     assert costs(in_region, ablated)
+
+
+def test_an_unknown_part_is_rejected():
+    with pytest.raises(StaridError, match="no part 'sky'; there are features, weights, motion, region"):
+        checked_part("sky")
+    assert checked_part(None) is None
+    assert checked_part("region") == "region"
 
 
 @pytest.mark.parametrize("algorithm", [LsiIdentifier, RsiIdentifier])

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import binom
+from scipy.stats import binom, wilcoxon
 
 from starid.attitude import Attitude, propagate, random_attitude
 from starid.camera import DEFAULT_CAMERA, Camera
@@ -114,23 +114,50 @@ def test_an_unknown_solver_of_an_identifier_is_rejected():
         make_identifier("lsi", solver="octave")
 
 
-@pytest.mark.parametrize(("magnitude_sigma", "from_region"), [(0.1, 0), (0.03, 22)])
-def test_rsi_follows_a_turning_sensor_among_false_stars(magnitude_sigma, from_region):
-    rng = np.random.default_rng(6)
+def sequence_among_false_stars(seed, magnitude_sigma=0.1):
+    """Errors, arcseconds (NaN: invalid), of 25 images of a turning sensor with 15 false stars each; the statistics."""
+    rng = np.random.default_rng(seed)
     recursion = RsiIdentifier()
     tracker = Tracker(recursion)
     attitude = random_attitude(rng)
+    errors = []
     for i in range(25):
         attitude = propagate(attitude, np.radians([0.3, 0.4, 0.2]), 1.0)
         solution = tracker.update(
             *points(rng, attitude, magnitude_sigma=magnitude_sigma, false_stars=15), float(i)
         )
-        if i > 0:
-            assert solution.valid
-            assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
-    statistics = recursion.statistics
-    assert statistics.in_region >= from_region  # errors of 0.1 mag put stars on the wrong side of the limit
-    assert 2.0 <= statistics.region_sum_deg / statistics.frames < 4.0
+        errors.append(solution.attitude.error_to(attitude).total_arcsec if solution.valid else np.nan)
+    return np.array(errors), recursion.statistics
+
+
+def test_rsi_follows_a_turning_sensor_among_false_stars():
+    errors, statistics = sequence_among_false_stars(6)
+    assert (errors[1:] < RIGHT_ARCSEC).all()
+    assert 2.0 <= statistics.region_sum_deg / (statistics.in_region + statistics.triggers) < 4.0
+
+
+def test_errors_of_magnitudes_leave_the_region_useless():
+    """Errors of 0.1 mag put stars on the wrong side of the limit of the features, those of 0.03 mag fewer."""
+    images_in_region = [
+        [sequence_among_false_stars(seed, sigma)[1].in_region for seed in range(30, 38)]
+        for sigma in (0.03, 0.1)
+    ]
+    assert wilcoxon(*images_in_region, alternative="greater").pvalue < 0.05  # the same eight sequences
+
+
+def test_while_the_features_disagree_the_whole_database_is_searched():
+    rng = np.random.default_rng(15)
+    features_only = RsiIdentifier(refinement=False, zero_point=20.3)
+    attitude = random_attitude(rng)
+    solution = features_only.identify(*points(rng, attitude, magnitude_sigma=0.02))
+    exceeded = []
+    for _ in range(40):
+        exceeded.append(not (solution.valid and solution.features.error_psi <= 0.5))
+        attitude = propagate(attitude, np.radians([0.3, 0.4, 0.2]), 1.0)
+        solution = features_only.track(*points(rng, attitude, magnitude_sigma=0.02), attitude)
+        assert (solution.features.region_deg == 0.0) == exceeded[-1]
+        assert not (solution.features.triggered and exceeded[-1])
+    assert 0 < sum(exceeded) < 40
 
 
 def test_the_reported_motion_is_that_of_the_boresight_on_the_sphere():

@@ -1,0 +1,217 @@
+"""The attitude from few stars near a predicted attitude whose error is known.
+
+Lost in space, four stars are needed to know that the attitude is not chance. A tracker knows more: where each star will be to a
+pixel, and how bright. A detection near such a place, as bright as expected, is hardly chance, even if it stands only three sigmas
+out of the noise. The prediction and the stars are combined by weighted least squares, so even two close stars do not leave the
+roll open.
+
+The bound on the probability of a false answer is ``Π λᵢ / k!``: k detections lie near places by chance. λᵢ is the mean number of
+detections like the one of star i in the gates of all places of stars of its brightness: local maxima of noise; if the prediction is
+wrong, other stars, as many as the catalogue has in the field; and whatever else the image shows around the places, such as the edge of
+a body, counted in the image itself.
+
+The stars must also be able to contradict the prediction. An error e of the prediction passes the test of its difference d from the
+attitude of the stars alone, ``dᵀ (C + S)⁻¹ d ≤ g`` with the covariances C and S of both, and leaves an error ``S (C + S)⁻¹ e`` in the
+answer: about axis i at most ``√(g (S − P)ᵢᵢ)``, where P is the covariance of the answer. This is the protection level of integrity
+monitoring.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from starid.arrays import Array, Indices
+from starid.attitude import Attitude
+from starid.camera import Camera
+from starid.camera.calibration import camera_jacobian, error_matrices, rotation_jacobian
+from starid.catalog import StarCatalog
+from starid.catalog.aberration import aberrated
+from starid.identification.solution import Reason, Solution
+from starid.imaging.detection import Detections
+
+MIN_STARS: Final = 2
+"""Least number of stars."""
+
+GATE: Final = 13.8
+"""Largest squared distance of a star from its place over its variance: 0.1 % of true stars have more (χ², 2 degrees of freedom)."""
+
+MAGNITUDE_GATE: Final = 1.0
+"""Largest difference from the expected magnitude, besides three sigmas of the flux: colours of stars, and their variability."""
+
+_SINGULAR: Final = 1e12
+"""Condition from which stars do not determine all three axes."""
+
+_MAX_CONTRADICTION: Final = 11.34
+"""Largest squared difference of prediction and stars over its variance (χ², 3 degrees of freedom): 1 % of good predictions have more."""
+
+_MAX_CHI2: Final = (13.8, 18.5, 22.5, 26.1, 29.6, 32.9, 36.1, 39.3, 42.3, 45.3)
+"""Quantiles of χ² with 2, 4, 6 … degrees of freedom that 0.1 % exceed."""
+
+
+def noise_peaks(ratio: Array, sigma_px: float) -> Array:
+    """Mean number of local maxima per pixel above `ratio` sigmas in white noise smoothed by a Gaussian.
+
+    Adler (1981), theorem 6.3.1: ``|Λ|^½ (2π)^(−3/2) u exp(−u²/2)``, where ``Λ = 1/(2σ²)`` is the variance of the slopes.
+    """
+    return np.asarray(ratio * np.exp(-0.5 * ratio**2) / ((2.0 * math.pi) ** 1.5 * 2.0 * sigma_px**2))
+
+
+def expected_places(
+    camera: Camera, stars: StarCatalog, predicted: Attitude, observer_velocity: Array | None = None
+) -> tuple[Indices, Array]:
+    """Return the rows (m,) of the stars that a predicted attitude shows, and their places (m, 2), pixels."""
+    near = stars.in_cone(predicted.boresight, camera.field_radius_rad)
+    icrs = stars.vectors[near]
+    if observer_velocity is not None:
+        icrs = aberrated(icrs, observer_velocity)
+    xy, inside = camera.project(predicted.to_sensor(icrs))
+    return near[inside].astype(np.int64), xy[inside]
+
+
+def solve_with_prediction(
+    camera: Camera,
+    stars: StarCatalog,
+    found: Detections,
+    predicted: Attitude,
+    covariance: Array,
+    zero_point: float,
+    max_false_probability: float,
+    max_error_rad: float,
+    *,
+    rivals: Array | None = None,
+    observer_velocity: Array | None = None,
+    known: Array | None = None,
+) -> Solution:
+    """Find the attitude from the stars near their predicted places.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera of the positions.
+    stars : StarCatalog
+        Stars that may be seen.
+    found : Detections
+        Detections near these places, also faint ones; see `starid.imaging.star_windows.detect_near`.
+    predicted : Attitude
+        The predicted attitude.
+    covariance : ndarray (3, 3)
+        Covariance of its error, rad², sensor frame.
+    zero_point : float
+        V of a star that yields a flux of one, for a star of solar colour.
+    max_false_probability : float
+        Largest bound on the probability of a false answer.
+    max_error_rad : float
+        Largest error about any axis that a wrong prediction may leave unnoticed.
+    rivals : ndarray (n,), optional
+        Detections like each, per square pixel, around all places; see `detect_near`.
+    observer_velocity : ndarray (3,), optional
+        See `starid.identification.star_identifier.StarIdentifier.identify`.
+    known : ndarray (9, 9), optional
+        Covariance of the camera's parameters.
+
+    Returns
+    -------
+    Solution
+        Its covariance is that of prediction and stars together. `catalog_index` refers to `stars`.
+    """
+    invalid = Solution.invalid(Reason.PREDICTION_LOST, mode="tracking")
+    rows, places = expected_places(camera, stars, predicted, observer_velocity)
+    if len(found) < MIN_STARS or len(rows) < MIN_STARS:
+        return Solution.invalid(Reason.TOO_FEW_STARS, mode="tracking")
+    seen = camera.back_project(places)
+    slopes = rotation_jacobian(camera.params, seen)
+    errors = error_matrices(found.position_errors)
+    off = found.xy_px[None, :, :] - places[:, None, :]
+    known = np.zeros((9, 9)) if known is None else known
+    by_camera = camera_jacobian(camera.params, seen)
+    spread = slopes @ covariance @ slopes.transpose(0, 2, 1) + by_camera @ known @ by_camera.transpose(
+        0, 2, 1
+    )
+    gates = spread[:, None] + errors[None, :]
+    distance2 = np.einsum("ijk,ijkl,ijl->ij", off, np.linalg.inv(gates), off)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        fainter = zero_point - 2.5 * np.log10(found.flux[None, :]) - stars.v[rows][:, None]
+    blur = 1.0857 * found.flux_sigma / found.flux
+    fits = (distance2 <= GATE) & (np.abs(fainter) <= MAGNITUDE_GATE + 3.0 * blur[None, :])
+    pairs = _assigned(distance2 + np.where(fits, 0.0, np.inf))
+    while len(pairs) >= MIN_STARS:
+        place, row = pairs.T
+        weights = np.linalg.inv(
+            gates[place, row] - slopes[place] @ covariance @ slopes[place].transpose(0, 2, 1)
+        )
+        turn, gain, information = _combined(slopes[place], off[place, row], weights, covariance)
+        residual = off[place, row] - slopes[place] @ turn
+        each = np.einsum("ni,nij,nj->n", residual, weights, residual)
+        chi2 = float(each.sum() + turn @ np.linalg.solve(covariance, turn))
+        if chi2 <= _MAX_CHI2[min(len(pairs), len(_MAX_CHI2)) - 1] + 2.0 * max(len(pairs) - len(_MAX_CHI2), 0):
+            break
+        pairs = np.delete(pairs, int(np.argmax(each)), axis=0)
+    else:
+        return invalid
+    if _unnoticed_rad(turn, information, covariance) > max_error_rad:
+        return invalid
+    area = math.pi * GATE * np.sqrt(np.linalg.det(gates[place, row]))
+    ratio = np.maximum(found.flux[row] / found.flux_sigma[row], 1.0)
+    magnitude = stars.v[rows]
+    alike = (
+        np.abs(magnitude[place, None] - magnitude[None, :]) <= MAGNITUDE_GATE + 3.0 * blur[row, None]
+    ).sum(axis=1)
+    by_chance = alike * (noise_peaks(ratio, found.psf_sigma_px) + alike / (camera.width * camera.height))
+    if rivals is not None:
+        by_chance = by_chance + rivals[row]
+    log_false = float(np.log(area * by_chance).sum()) - math.lgamma(len(pairs) + 1)
+    if log_false > math.log(max_false_probability):
+        return invalid
+    # errors of the camera displace neighbouring stars alike, so they are not averaged
+    from_camera = np.einsum("nij,njk->ik", gain, by_camera[place])
+    rest = np.eye(3) - np.einsum("nij,njk->ik", gain, slopes[place])
+    noise = np.einsum("nij,njk,nlk->il", gain, errors[row], gain)
+    posterior = noise + rest @ covariance @ rest.T + from_camera @ known @ from_camera.T
+    return Solution(
+        valid=True,
+        reason=Reason.OK,
+        quaternion_xyzw=predicted.rotated(turn).quaternion_xyzw,
+        detection_index=row,
+        catalog_index=rows[place],
+        hip=stars.hip[rows[place]],
+        covariance=posterior,
+        rms_px=math.sqrt(float(np.mean(np.sum(residual**2, axis=1)))),
+        sigma_px=math.sqrt(float(np.mean(np.einsum("nii->n", errors[row]))) / 2.0),
+        probability_false=math.exp(min(log_false, 0.0)),
+        mode="tracking",
+    )
+
+
+def _assigned(cost: Array) -> Indices:
+    """Pairs (k, 2) of rows and columns of finite cost, cheapest first, each row and column once."""
+    chosen: list[tuple[int, int]] = []
+    left = cost.copy()
+    while left.size and np.isfinite(left.min()):
+        i, j = divmod(int(np.argmin(left)), left.shape[1])
+        chosen.append((i, j))
+        left[i, :] = np.inf
+        left[:, j] = np.inf
+    return np.array(chosen, dtype=np.int64).reshape(-1, 2)
+
+
+def _combined(slopes: Array, off: Array, weights: Array, covariance: Array) -> tuple[Array, Array, Array]:
+    """Return the weighted mean of prediction and stars, a rotation (3,), the gains (n, 3, 2), and the stars' information (3, 3)."""
+    information = np.einsum("nij,nik,nkl->jl", slopes, weights, slopes)
+    gain = np.linalg.inv(np.linalg.inv(covariance) + information) @ slopes.transpose(0, 2, 1) @ weights
+    return np.asarray(np.einsum("nij,nj->i", gain, off)), np.asarray(gain), np.asarray(information)
+
+
+def _unnoticed_rad(turn: Array, information: Array, covariance: Array) -> float:
+    """Largest error about any axis that a wrong prediction may leave; infinite if stars and prediction contradict each other."""
+    prior = np.linalg.inv(covariance)
+    if np.linalg.cond(information) > _SINGULAR:
+        return math.inf
+    stars = np.linalg.inv(information)
+    alone = stars @ (prior + information) @ turn
+    if alone @ np.linalg.solve(covariance + stars, alone) > _MAX_CONTRADICTION:
+        return math.inf
+    left = np.diag(stars - np.linalg.inv(prior + information))
+    return math.sqrt(_MAX_CONTRADICTION * max(float(left.max()), 0.0))

@@ -1,0 +1,94 @@
+"""Tracking with three quarters of the field hidden: fewer stars than lost in space, and fainter ones, are enough."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from starhil.emulator.benchmarks.campaign import WRONG_DEG, block_side
+from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
+from starhil.emulator.sensor.pipeline.messages import FrameRequest, FrameResult
+from starhil.emulator.sensor.pipeline.pipeline import Pipeline
+from starhil.emulator.truth.source import ZERO_RATE, TruthState
+from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
+
+PREDICTION_ARCSEC = np.array([20.0, 20.0, 35.0])
+"""Error of a prediction that is good to 0.12 px."""
+
+COVARIANCE = np.diag((np.array([45.0, 45.0, 75.0]) / ARCSEC_PER_RAD) ** 2)
+"""As the device states it after two images."""
+FRAMES = 60
+
+
+def error_arcsec(result: FrameResult, truth: Attitude) -> float:
+    """The larger of the errors of boresight and roll."""
+    off = Attitude(np.array(result.quaternion_xyzw)).error_to(truth)
+    return max(off.cross_boresight_arcsec, off.roll_arcsec)
+
+
+def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
+    expose = Pipeline._expose
+
+    def hidden(self: Pipeline, request: FrameRequest):
+        exposure = expose(self, request)
+        dark = block_side(exposure.image, 0.75, np.random.default_rng((9, request.index)))
+        return replace(exposure, image=dark)
+
+    monkeypatch.setattr(Pipeline, "_expose", hidden)
+    device, as_lost = (
+        EcssDevice(EcssPlan("cubestar", ("device.tracking_error_deg=0.4",))),
+        EcssDevice(EcssPlan("cubestar", ("device.tracking_stars=0",))),
+    )
+    lost = tracked = 0
+    for number in range(FRAMES):
+        rng = np.random.default_rng((5, number))
+        truth = random_attitude(rng)
+        error = PREDICTION_ARCSEC / ARCSEC_PER_RAD * rng.standard_normal(3)
+        request = FrameRequest(
+            number, TruthState(truth, ZERO_RATE), device.exposure_s, device.gain, device.settings
+        )
+        guided = replace(request, predicted=truth.rotated(error), prediction_covariance=COVARIANCE)
+        without = as_lost.pipeline.handle(guided)
+        result = device.pipeline.handle(guided)
+        assert isinstance(without, FrameResult)
+        assert isinstance(result, FrameResult)
+        lost, tracked = lost + without.valid, tracked + result.valid
+        if result.valid:
+            assert error_arcsec(result, truth) < 3600.0 * WRONG_DEG
+            assert result.tracked
+            assert result.matched == len(result.stars)
+        far = replace(guided, predicted=truth.rotated(np.radians(rng.uniform(-3.0, 3.0, 3))))
+        answer = device.pipeline.handle(far)
+        assert isinstance(answer, FrameResult)
+        assert not answer.valid or error_arcsec(answer, truth) < 3600.0 * WRONG_DEG
+    assert lost < 0.7 * FRAMES
+    assert tracked > FRAMES * 0.95 - 3.0 * math.sqrt(FRAMES * 0.95 * 0.05)
+
+
+@pytest.mark.parametrize("rate_deg_s", [0.0, 2.0])
+def test_windows_find_the_attitude_of_the_whole_image(rate_deg_s: float) -> None:
+    """With trails, the whole image is searched."""
+    whole, windows = (
+        EcssDevice(EcssPlan("cubestar", (f"device.tracking_windows={on}",))) for on in ("false", "true")
+    )
+    rng = np.random.default_rng(6)
+    for number in range(5):
+        truth, rate = random_attitude(rng), np.radians([rate_deg_s, 0.0, 0.0])
+        request = FrameRequest(
+            number, TruthState(truth, rate), whole.exposure_s, whole.gain, whole.settings,
+            predicted=truth.rotated(PREDICTION_ARCSEC / ARCSEC_PER_RAD * rng.standard_normal(3)),
+            prediction_covariance=COVARIANCE, predicted_rate_rad_s=(float(rate[0]), 0.0, 0.0),
+        )  # fmt: skip
+        one, other = whole.pipeline.handle(request), windows.pipeline.handle(request)
+        assert isinstance(one, FrameResult)
+        assert isinstance(other, FrameResult)
+        assert one.valid == other.valid
+        if rate_deg_s > 0.0:
+            assert other.quaternion_xyzw == one.quaternion_xyzw
+        elif one.valid:
+            assert other.detected <= one.detected
+            off = Attitude(np.array(other.quaternion_xyzw)).error_to(Attitude(np.array(one.quaternion_xyzw)))
+            assert off.cross_boresight_arcsec < 2.0 * one.sigma_cross_arcsec

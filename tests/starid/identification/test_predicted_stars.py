@@ -1,0 +1,103 @@
+"""Few stars near a prediction: the bound, the combined attitude, and predictions that are wrong."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, maximum_filter
+
+from starid.attitude import Attitude, random_attitude
+from starid.camera import DEFAULT_CAMERA
+from starid.catalog import StarCatalog, load_catalog
+from starid.identification.predicted_stars import expected_places, noise_peaks, solve_with_prediction
+from starid.identification.solution import Solution
+from starid.imaging.detection import Detections
+
+SIGMA_RAD = 60.0 / 206265.0
+PRIOR = np.diag([SIGMA_RAD**2, SIGMA_RAD**2, 4.0 * SIGMA_RAD**2])
+ZERO_POINT, SNR, POSITION_PX = 14.0, 8.0, 0.15
+MAX_ERROR_RAD = math.radians(0.3)
+
+
+@pytest.fixture(scope="module")
+def bright() -> StarCatalog:
+    return load_catalog().brighter_than(4.5)
+
+
+def detections(xy: np.ndarray, magnitude: np.ndarray) -> Detections:
+    count = len(xy)
+    flux = 10.0 ** (-0.4 * (magnitude - ZERO_POINT))
+    errors = np.full((count, 2), POSITION_PX)
+    no = np.zeros(count, dtype=bool)
+    return Detections(xy, flux, flux / SNR, errors, np.zeros(count), no, no, 10.0, 1.0, 1.2, 0.0, 0, "")
+
+
+def image(truth: Attitude, stars: StarCatalog, count: int | None, rng: np.random.Generator) -> Detections:
+    """A number of the stars in the field, chosen at random, with noise."""
+    rows, xy = expected_places(DEFAULT_CAMERA, stars, truth)
+    chosen = rng.permutation(len(rows))[:count]
+    noisy = xy[chosen] + POSITION_PX * rng.standard_normal((len(chosen), 2))
+    return detections(noisy, stars.v[rows[chosen]])
+
+
+def solve(found: Detections, predicted: Attitude, stars: StarCatalog) -> Solution:
+    return solve_with_prediction(
+        DEFAULT_CAMERA, stars, found, predicted, PRIOR, ZERO_POINT, 1e-5, MAX_ERROR_RAD
+    )
+
+
+@pytest.mark.parametrize("ratio", [3.0, 3.5, 4.0])
+def test_peaks_of_smoothed_noise_are_as_many_as_stated(ratio: float) -> None:
+    size, sigma = 2000, 2.5
+    field = gaussian_filter(np.random.default_rng(1).standard_normal((size, size)), sigma, mode="wrap")
+    field /= field.std()
+    peaks = np.count_nonzero((field == maximum_filter(field, 3, mode="wrap")) & (field > ratio))
+    expected = size * size * float(noise_peaks(np.array(ratio), sigma))
+    # the formula counts maxima less saddles and minima: right to a few per cent at these levels
+    assert peaks == pytest.approx(expected, abs=4.0 * math.sqrt(expected) + 0.1 * expected)
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_the_error_with_few_stars_is_as_stated(bright: StarCatalog, count: int) -> None:
+    rng = np.random.default_rng(count)
+    squares = []
+    for _ in range(300):
+        truth = random_attitude(rng)
+        error = np.sqrt(np.diag(PRIOR)) * rng.standard_normal(3)
+        solution = solve(image(truth, bright, count, rng), truth.rotated(error), bright)
+        if solution.valid:
+            off = solution.attitude.error_to(truth)
+            assert max(off.cross_boresight_arcsec, off.roll_arcsec) < 360.0
+            squares.append(
+                off.rotation_vector_rad @ np.linalg.solve(solution.covariance, off.rotation_vector_rad)
+            )
+    assert len(squares) > {2: 60, 3: 270, 5: 290}[count]
+    assert np.mean(squares) == pytest.approx(3.0, abs=4.0 * math.sqrt(6.0 / len(squares)))
+
+
+def test_one_star_is_not_enough(bright: StarCatalog) -> None:
+    rng = np.random.default_rng(4)
+    for _ in range(100):
+        truth = random_attitude(rng)
+        assert not solve(image(truth, bright, 1, rng), truth, bright).valid
+
+
+def test_a_wrong_prediction_is_not_confirmed_by_other_stars(bright: StarCatalog) -> None:
+    rng = np.random.default_rng(5)
+    for _ in range(2000):
+        truth = random_attitude(rng)
+        found = image(truth, bright, None, rng)
+        assert not solve(found, truth.rotated(np.radians(rng.uniform(-5.0, 5.0, 3))), bright).valid
+
+
+def test_a_star_far_from_its_place_or_of_another_brightness_is_left_out(bright: StarCatalog) -> None:
+    rng = np.random.default_rng(6)
+    truth = random_attitude(rng)
+    rows, xy = expected_places(DEFAULT_CAMERA, bright, truth)
+    xy, magnitude = xy[:5].copy(), bright.v[rows[:5]].copy()
+    xy[1] += 8.0
+    magnitude[3] += 2.5
+    solution = solve(detections(xy, magnitude), truth, bright)
+    assert sorted(solution.detection_index.tolist()) == [0, 2, 4]
