@@ -164,11 +164,13 @@ def _border_of(camera: Camera) -> Array:
 
 
 def through_baffle(objects: SkyObjects, attitude: Attitude) -> tuple[str, ...]:
-    """Return which of `sun` and `earth` is within its exclusion angle, so that its light saturates the image."""
-    passing = []
-    sun, earth = objects.sun, objects.earth
-    if sun is not None and _off_axis_deg(attitude, sun) < sun.exclusion_deg:
-        passing.append("sun")
+    """Return which of `sun`, `moon` and `earth` is within its exclusion angle, so that its light saturates the image."""
+    earth = objects.earth
+    passing = [
+        name
+        for name, body in (("sun", objects.sun), ("moon", objects.moon))
+        if body is not None and _off_axis_deg(attitude, body) < body.exclusion_deg
+    ]
     if earth is not None and earth.exclusion_deg > 0.0:
         off_axis = _off_axis_deg(attitude, earth)
         near_deg = min(off_axis, earth.radius_deg)

@@ -69,6 +69,8 @@ class Moon(CelestialBody):
     """Position angle of the midpoint of the bright limb, from north through east."""
     glare_share: float = limited(0.0, 1.0, LENS_SCATTER)
     """Fraction of its light that the lens scatters over the field; falls with the square of the angle."""
+    exclusion_deg: float = limited(0.0, 180.0, 0.0)
+    """Angle from the boresight within which moonlight passes the baffle and saturates the image."""
     reach_deg: float = limited(0.0, 180.0, 180.0)
     """Angle from the boresight beyond which none of its light enters the lens."""
 

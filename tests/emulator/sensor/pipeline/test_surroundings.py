@@ -94,6 +94,15 @@ def test_the_sun_within_its_exclusion_angle_blinds_the_sensor_unless_the_lens_is
     assert (covered.reason, covered.in_field) == ("too_few_stars", ())
 
 
+def test_the_moon_within_its_exclusion_angle_blinds_the_sensor(pipeline):
+    def seen(off_deg):
+        moon = {"ra_deg": 83.8, "dec_deg": -1.2 + off_deg, "exclusion_deg": 25.0}
+        return pipeline.handle(replace(REQUEST, faults={"moon": moon}))
+
+    assert (seen(24.0).valid, seen(24.0).reason, seen(24.0).in_field) == (False, "blinded", ("moon",))
+    assert (seen(26.0).valid, seen(26.0).in_field) == (True, ())
+
+
 def test_a_covered_lens_leaves_too_few_stars_lost_in_space_and_tracking(pipeline):
     for index, predicted in ((10, None), (11, ORION), (12, None), (13, ORION)):
         for cover in ({"blank": True}, {"blocked_share": 1.0}):
