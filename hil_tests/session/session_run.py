@@ -56,6 +56,8 @@ class SessionRequest:
     quiet: bool = False
     view: str | None = None
     """Address of the console that shows the results; `auto` with `start`: the started emulator's."""
+    settings: tuple[str, ...] = ()
+    """Settings of the started emulator, which those of the script override."""
 
 
 def find_script(path: Path) -> Path:
@@ -275,7 +277,7 @@ def _emulator(
             can=options.can or "off",
             dialect=options.dialect,
             seed=section.seed,
-            settings=pointed(script.truth.attitude, section.settings),
+            settings=[*request.settings, *pointed(script.truth.attitude, section.settings)],
             state_dir=state,
             truth_log=truth_log,
             extra=extra,
