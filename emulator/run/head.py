@@ -81,6 +81,7 @@ class Head:
         self._wiring = wiring
         self._on_warm = on_warm
         self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="state")
+        self._writes: set[asyncio.Future[EmulatorError | None]] = set()
         self._pump: ClockPump | None = None
         self._warm_up_task: asyncio.Task[None] | None = None
         self._revival: PipelineRevival | None = None
@@ -117,10 +118,13 @@ class Head:
         loop = asyncio.get_running_loop()
 
         def background(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
-            def run() -> None:
-                loop.call_soon_threadsafe(done, outcome(work))
+            def ended(write: asyncio.Future[EmulatorError | None]) -> None:
+                self._writes.discard(write)
+                done(write.result())
 
-            self._writer.submit(run)
+            write = loop.run_in_executor(self._writer, outcome, work)
+            self._writes.add(write)
+            write.add_done_callback(ended)
 
         return background
 
@@ -247,9 +251,10 @@ class Head:
         await close_all(closers)
 
     async def _finish_writing(self) -> None:
-        """Wait for the writes in progress, and for their outcomes, which arrive in the event loop."""
+        """Wait for the writes in progress, and for those that follow from their outcomes, which arrive in the event loop."""
+        while self._writes:
+            await asyncio.wait(self._writes)
         self._writer.shutdown(wait=True)
-        await asyncio.sleep(0)
 
 
 async def _cancel(task: asyncio.Task[None]) -> None:
