@@ -2,6 +2,8 @@
 # make test        set up and run all tests (those on a real vcan0 in a guest); the last lines say what ran, and why tests were skipped
 # make check       for whoever edits, a minute and a half: ruff, contracts of imports, and tests without processes and long computations
 # make lowest      the tests of LOWEST with the lowest versions of dependencies that pyproject.toml admits
+# make versions    the same tests with the newest dependencies on VERSIONS of Python, on the Debians that have them (as root, on Debian)
+# make arm64       the same bytes as here on an emulated arm64, and on the processor of an older server (as root, on Debian; an hour)
 # make lint        ruff, mypy --strict and the contracts of imports
 # make docs        pages and API reference in out/docs; a warning or a broken link fails
 # make reproduce   every experiment of the thesis again; report.md, tables and plots in out/reproduce
@@ -26,12 +28,13 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 # a target whose recipe failed is made again: the file .venv/pyvenv.cfg is written before pip is found to be missing
 .DELETE_ON_ERROR:
-.PHONY: help demo check test lowest lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos obc clean
+.PHONY: help demo check test lowest versions arm64 lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos obc clean
 help:
 	@sed -n 's/^# make /make /p' Makefile
 
 $(VENV)/pyvenv.cfg:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "starhil needs Python 3.11 or newer; call: make PYTHON=/path/to/python3.11")'
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.maxsize > 2**32 else "starhil needs a 64-bit system: x86-64 or arm64")'
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.product: pyproject.toml | $(VENV)/pyvenv.cfg
@@ -108,9 +111,30 @@ out/lowest/.installed: pyproject.toml tools/lowest_versions.py
 	out/lowest/bin/pip install --quiet --no-compile --constraint out/lowest/constraints.txt --editable '.[lab]' $(LOWEST_TOOLS)
 	@touch $@
 
+RUN_LOWEST := -m pytest -q -m "not process and not browser and not socketcan" \
+	-k "not fuzz and not stateful and not mutant and not durand" $(LOWEST)
+
 lowest: out/lowest/.installed
-	nice out/lowest/bin/python -m pytest -q -m "not process and not browser and not socketcan" \
-		-k "not fuzz and not stateful and not mutant and not durand" $(LOWEST)
+	nice out/lowest/bin/python $(RUN_LOWEST)
+
+VERSIONS := trixie:3.13 forky:3.14
+versions: export RUN_LOWEST := $(RUN_LOWEST)
+versions:
+	@tools/install_test_packages roots
+	@for each in $(VERSIONS); do python=python$${each#*:}; echo "$$python on Debian $${each%:*}"; \
+		tools/debian_root $${each%:*} amd64 $$python,$$python-venv sh -ec "$$python -m venv ~/venv; \
+			pip install --quiet --no-compile --upgrade --upgrade-strategy eager --editable '.[lab]' $(LOWEST_TOOLS); \
+			nice python $$RUN_LOWEST" || exit; done
+
+ARM64 := tools/debian_root trixie arm64 python3.13,python3.13-venv
+ARM64_VENV := out/roots/trixie-arm64-python3.13/root/venv
+$(ARM64_VENV)/.installed: pyproject.toml
+	@tools/install_test_packages arm64
+	$(ARM64) sh -ec 'python3.13 -m venv ~/venv; pip install --quiet --no-compile --editable . pytest'
+	@touch $@
+
+arm64: $(VENV)/.developer $(ARM64_VENV)/.installed
+	ARM64_ROOT="$(ARM64)" $(BIN)/python -m pytest -v --durations 0 tests/process/test_other_processor.py
 
 lint: $(VENV)/.developer
 	$(BIN)/ruff check .

@@ -10,6 +10,7 @@ import io
 import math
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -42,6 +43,7 @@ from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
+from tests.emulator.cli.command_line import run_command_line
 from tests.waiting import PATIENCE_S
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -511,3 +513,22 @@ def test_examples_in_docstrings_are_indented_below_their_colons():
         and re.search(r"::\n\n\S", ast.get_docstring(node) or "")
     ]
     assert wrong == []
+
+
+@pytest.mark.process
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd-analyze")
+def test_systemd_takes_the_service_of_a_raspberry_pi(tmp_path):
+    (text,) = [block.text for block in blocks("raspberry-pi.md", "ini") if "ExecStart=" in block.text]
+    command = re.search(r"^ExecStart=/opt/starhil/bin/(starhil run .*)$", text, re.MULTILINE)[1]
+    unit = tmp_path / "starhil.service"
+    unit.write_text(text.replace("/opt/starhil/bin/", f"{Path(sys.executable).parent}/"))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", str(unit)], capture_output=True, text=True, check=False
+    )
+    assert [line for line in done.stderr.splitlines() if "starhil.service" in line] == []
+    assert done.returncode == 0
+    words = shlex.split(
+        command.replace("/var/lib/starhil", str(tmp_path)).replace("/dev/ttyAMA0", str(tmp_path / "tty"))
+    )
+    status, _out, said = run_command_line(*words[1:])  # all its options are taken; there is no such port
+    assert (status, said.partition("tty: ")[2][:12]) == (2, "no such port")

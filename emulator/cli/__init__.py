@@ -8,6 +8,8 @@ import sys
 
 def main() -> None:
     """Run the command line; Ctrl-C during imports ends it without a traceback."""
+    if sys.maxsize < 2**32:
+        raise SystemExit("starhil: needs a 64-bit system: x86-64 or arm64")
     try:
         if sys.argv[1:2] == ["run"] and "--help" not in sys.argv:
             for number in (signal.SIGTERM, signal.SIGHUP):

@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from starid.arrays import Array
 from starid.kernels.jit import compiled_ieee, inner
 
 REACH: Final = 8.0
@@ -16,8 +17,16 @@ _LEAST_EXPONENT: Final = -0.6
 _PER_SIGMA: Final = 32
 _COUNT: Final = int(2 * REACH) * _PER_SIGMA + 1
 _NODES: Final = np.linspace(-REACH, REACH, _COUNT)
-_CDF: Final = np.array([0.5 * math.erfc(-node / math.sqrt(2.0)) for node in _NODES])
-_PDF: Final = np.array([math.exp(-0.5 * node * node) / math.sqrt(2.0 * math.pi) for node in _NODES])
+_GRID: Final = 2.0**36
+"""The tables hold multiples of 1/_GRID: C libraries differ in the last digit of erfc and exp."""
+
+
+def _on_grid(values: list[float]) -> Array:
+    return np.round(np.array(values) * _GRID) / _GRID
+
+
+_CDF: Final = _on_grid([0.5 * math.erfc(-node / math.sqrt(2.0)) for node in _NODES])
+_PDF: Final = _on_grid([math.exp(-0.5 * node * node) / math.sqrt(2.0 * math.pi) for node in _NODES])
 
 
 @compiled_ieee

@@ -88,3 +88,30 @@ def test_a_virtual_environment_that_could_not_be_made_is_made_again(tmp_path):
     for _ in range(2):
         done = subprocess.run(make, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         assert (done.returncode, "ensurepip is not available" in done.stdout) == (2, True)
+
+
+ON_32_BITS = "import sys; sys.maxsize = 2**31 - 1; "
+
+
+@pytest.mark.parametrize("module", ["starhil.emulator.cli", "starid.cli"])
+def test_a_32_bit_system_is_named_by_the_commands(module):
+    done = subprocess.run(
+        [sys.executable, "-c", f"{ON_32_BITS} from {module} import main; main()"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    name = module.partition(".")[0]
+    assert (done.returncode, done.stderr) == (1, f"{name}: needs a 64-bit system: x86-64 or arm64\n")
+
+
+def test_a_32_bit_system_is_named_by_make(tmp_path):
+    python = tmp_path / "python3"
+    python.write_text(f'#!/bin/sh\n[ $1 = -c ] && exec {sys.executable} -c "{ON_32_BITS} $2"\ntouch "$3"\n')
+    python.chmod(0o755)
+    make = ["make", "-C", str(tmp_path), "-f", str(ROOT / "Makefile"), f"PYTHON={python}", ".venv/pyvenv.cfg"]
+    done = subprocess.run(make, capture_output=True, text=True, timeout=20, check=False)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[0] == "starhil needs a 64-bit system: x86-64 or arm64"
+    assert not (tmp_path / ".venv").exists()

@@ -130,7 +130,7 @@ def test_a_session_passes_on_the_kernel_bus(name, tmp_path, unit):
 
 
 def test_commands_are_answered_while_cangen_floods_the_bus(obc):
-    flood = subprocess.Popen([shutil.which("cangen"), "vcan0", "-g", "2", "-e", "-I", "i", "-L", "8"])
+    flood = subprocess.Popen([shutil.which("cangen"), "vcan0", "-g", "5", "-e", "-I", "i", "-L", "8"])
     try:
         for _ in range(50):
             assert len(obc.telemetry("star_tracker", timeout_s=PATIENCE_S)) > 20
