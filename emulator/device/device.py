@@ -24,12 +24,12 @@ from starhil.emulator.device.snapshot import Constants, Snapshot
 from starhil.emulator.device.state_store import StateStore
 from starhil.emulator.device.subscriptions import Subscriptions
 from starhil.emulator.device.surroundings import Surroundings
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, one_line
 from starhil.emulator.profile import Profile
 from starhil.emulator.sensor.pipeline.client import PipelineClient
 from starhil.emulator.sensor.pipeline.messages import IDENTITY, Quaternion
 from starhil.emulator.simulation.clock import Clock, DeviceTime
-from starhil.emulator.simulation.guard import log_internal_error, one_line
+from starhil.emulator.simulation.guard import log_internal_error
 from starhil.emulator.simulation.output_file import Output
 from starhil.emulator.simulation.scheduler import Event, Scheduler
 from starhil.emulator.truth.source import TruthSource

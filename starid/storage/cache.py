@@ -213,7 +213,6 @@ def cached_files() -> list[CachedFile]:
 
 
 def _size_of_folder(folder: Path) -> int:
-    """Bytes of the files in a folder and the folders in it."""
     return sum(path.stat().st_size for path in folder.rglob("*") if not path.is_dir())
 
 
