@@ -1,10 +1,11 @@
-"""The error raised by whatever reads a file, opens a port or takes input from outside.
+"""The error raised by whatever reads a file, opens a port or takes input from outside, and unexpected errors in one line.
 
 A docstring mentions it only where that does not go without saying.
 """
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -26,3 +27,13 @@ def explained(
         is_of_file = isinstance(error, OSError) and error.filename is not None
         why = getattr(error, "strerror", None) if is_of_file else reason(error)
         raise EmulatorError(f"{what} ({why})" + (f"; {remedy}" if remedy else "")) from None
+
+
+def one_line(error: BaseException) -> str:
+    """Return type, text and origin of an unexpected error in one line."""
+    text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames:
+        return text
+    module = "/".join(frames[-1].filename.split("/")[-2:])
+    return f"{text} ({module}:{frames[-1].lineno})"

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 FILE_OPTIONS: Final[dict[Kind, str]] = {"unit": "--starhil-unit", "profile": "--starhil-profile"}
 """Options that name what ships with the package, or a file."""
-_OF_EMULATOR: Final = (None, "auto", "off")
+_EMULATOR_LINKS: Final = (None, "auto", "off")
 """Values of the options of links that name no unit."""
 
 
@@ -155,7 +155,7 @@ def _unit_option(config: pytest.Config) -> str:
         (
             name
             for name in ("--starhil-serial", "--starhil-can")
-            if config.getoption(name) not in _OF_EMULATOR
+            if config.getoption(name) not in _EMULATOR_LINKS
         ),
         "",
     )
@@ -188,12 +188,12 @@ def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
     spec, unit, other = option(f"--starhil-{link}"), option("--starhil-unit"), _unit_option(request.config)
     if spec == "off":
         pytest.skip(f"--starhil-{link} off")
-    if spec not in _OF_EMULATOR and request.node.get_closest_marker("starhil") is not None:
+    if spec not in _EMULATOR_LINKS and request.node.get_closest_marker("starhil") is not None:
         pytest.skip(f"{other} names a unit, and the marker starhil needs an emulator")
-    if spec in _OF_EMULATOR and other:
+    if spec in _EMULATOR_LINKS and other:
         where = {"serial": "port", "can": "bus"}[link]
         pytest.skip(f"{other} names a unit; give its {where} with --starhil-{link} to run this test")
-    if spec in _OF_EMULATOR:
+    if spec in _EMULATOR_LINKS:
         emulator: EmulatorProcess = request.getfixturevalue("starhil_emulator")
         spec, unit = emulator.ready.get(link), emulator.unit
         if spec is None:

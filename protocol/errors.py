@@ -91,9 +91,9 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join([*names[:MAX_LISTED], *more]) or "none"
 
 
-def did_you_mean(name: str, known: Iterable[str]) -> str:
+def did_you_mean(name: str, names: Iterable[str]) -> str:
     """Return `; did you mean …?` with the known names most similar to an unknown one, or an empty text."""
     if len(name) > LONGEST_NAME:
         return ""
-    near = difflib.get_close_matches(name, list(islice(known, MAX_NAMES)), n=3, cutoff=_MIN_SIMILARITY)
+    near = difflib.get_close_matches(name, list(islice(names, MAX_NAMES)), n=3, cutoff=_MIN_SIMILARITY)
     return f"; did you mean {', '.join(near)}?" if near else ""

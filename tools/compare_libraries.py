@@ -70,17 +70,17 @@ def detection(frames: int, seed: int) -> list[Measurement]:
     errors: dict[str, list[Array]] = {name: [] for name in finders}
     for index in range(frames):
         frame = renderer.render(random_attitude(rng), np.zeros(3), index)
-        found = {name: find(frame.image) for name, find in finders.items()}
+        positions = {name: find(frame.image) for name, find in finders.items()}
         for name, find in finders.items():
             times[name].append(median_ms(partial(find, frame.image), 1))
         stars = frame.stars.xy_px
         distance, _ = cKDTree(stars).query(stars, k=2)
         inside = np.all((stars > ISOLATION_PX) & (stars < camera.width - 1 - ISOLATION_PX), axis=1)
-        wanted = (distance[:, 1] > ISOLATION_PX) & inside & (frame.stars.magnitude <= FAINTEST_MAGNITUDE)
-        nearest = {name: cKDTree(places).query(stars[wanted]) for name, places in found.items()}
+        selection = (distance[:, 1] > ISOLATION_PX) & inside & (frame.stars.magnitude <= FAINTEST_MAGNITUDE)
+        nearest = {name: cKDTree(places).query(stars[selection]) for name, places in positions.items()}
         both = np.all([gap < MATCH_PX for gap, _ in nearest.values()], axis=0)
         for name, (_, row) in nearest.items():
-            errors[name].append(found[name][row[both]] - stars[wanted][both])
+            errors[name].append(positions[name][row[both]] - stars[selection][both])
     return [
         (
             f"{name}, {sum(map(len, errors[name]))} stars in {frames} images",

@@ -56,20 +56,20 @@ def read_csv(path: Path) -> np.ndarray[Any, Any]:
 def compare(samples: np.ndarray[Any, Any], truth: np.ndarray[Any, Any]) -> Comparison:
     """Compare the samples of the OBC with the emulator's truth log, frame by frame."""
     valid = samples[samples["valid"] == 1]
-    seen = valid[np.unique(valid["frame_counter"], return_index=True)[1]]
-    true = truth[np.searchsorted(truth["frame"], seen["frame_counter"])]
+    frames = valid[np.unique(valid["frame_counter"], return_index=True)[1]]
+    true = truth[np.searchsorted(truth["frame"], frames["frame_counter"])]
     errors = [
         Attitude.from_quaternion([measured[f"q_{axis}"] for axis in "xyzw"]).error_to(
             Attitude.from_quaternion([row[f"true_q{axis}"] for axis in "xyzw"])
         )
-        for measured, row in zip(seen, true, strict=True)
+        for measured, row in zip(frames, true, strict=True)
     ]
     return Comparison(
         np.array([error.cross_boresight_arcsec for error in errors]),
         np.array([error.roll_arcsec for error in errors]),
-        np.linalg.norm([seen[f"rate_{axis}"] for axis in "xyz"], axis=0),
-        seen["latency_ms"],
-        seen["latency"],
+        np.linalg.norm([frames[f"rate_{axis}"] for axis in "xyz"], axis=0),
+        frames["latency_ms"],
+        frames["latency"],
         len(samples) - len(valid),
     )
 
@@ -102,13 +102,13 @@ def run_features(out: Path) -> str | None:
     )
 
 
-def within_limits(found: Comparison) -> bool:
+def within_limits(comparison: Comparison) -> bool:
     """Whether every sample of a session was valid and within the error limits."""
     return (
-        len(found.cross_arcsec) > 0
-        and found.invalid == 0
-        and bool(found.cross_arcsec.max() <= CROSS_LIMIT_ARCSEC)
-        and bool(found.roll_arcsec.max() <= ROLL_LIMIT_ARCSEC)
+        len(comparison.cross_arcsec) > 0
+        and comparison.invalid == 0
+        and bool(comparison.cross_arcsec.max() <= CROSS_LIMIT_ARCSEC)
+        and bool(comparison.roll_arcsec.max() <= ROLL_LIMIT_ARCSEC)
     )
 
 
@@ -120,24 +120,26 @@ def report(comparisons: dict[str, Comparison], console: Console) -> bool:
         title="Errors of the attitude of the ideal sensor, as read by the OBC",
     )
     figures: dict[str, Callable[[Comparison], str]] = {
-        "frames": lambda found: str(len(found.cross_arcsec)),
-        "samples without a valid attitude": lambda found: str(found.invalid),
-        "body rate, median, deg/s": lambda found: f"{np.median(found.rate_deg_s):.3f}",
-        "boresight error, median, arcsec": lambda found: f"{np.median(found.cross_arcsec):.2f}",
-        "boresight error, maximum, arcsec": lambda found: f"{found.cross_arcsec.max():.2f}",
-        "roll error, median, arcsec": lambda found: f"{np.median(found.roll_arcsec):.2f}",
-        "roll error, maximum, arcsec": lambda found: f"{found.roll_arcsec.max():.2f}",
-        "mid-exposure to attitude, median, ms": lambda found: f"{np.median(found.latency_ms):.1f}",
-        "request to reply, median, ms": lambda found: f"{np.median(found.reply_ms):.2f}",
-        "request to reply, 99 %, ms": lambda found: f"{percentile(found.reply_ms.tolist(), 0.99):.2f}",
-        f"within {CROSS_LIMIT_ARCSEC:.0f} and {ROLL_LIMIT_ARCSEC:.0f} arcsec": lambda found: (
-            "yes" if within_limits(found) else "NO"
+        "frames": lambda comparison: str(len(comparison.cross_arcsec)),
+        "samples without a valid attitude": lambda comparison: str(comparison.invalid),
+        "body rate, median, deg/s": lambda comparison: f"{np.median(comparison.rate_deg_s):.3f}",
+        "boresight error, median, arcsec": lambda comparison: f"{np.median(comparison.cross_arcsec):.2f}",
+        "boresight error, maximum, arcsec": lambda comparison: f"{comparison.cross_arcsec.max():.2f}",
+        "roll error, median, arcsec": lambda comparison: f"{np.median(comparison.roll_arcsec):.2f}",
+        "roll error, maximum, arcsec": lambda comparison: f"{comparison.roll_arcsec.max():.2f}",
+        "mid-exposure to attitude, median, ms": lambda comparison: f"{np.median(comparison.latency_ms):.1f}",
+        "request to reply, median, ms": lambda comparison: f"{np.median(comparison.reply_ms):.2f}",
+        "request to reply, 99 %, ms": lambda comparison: (
+            f"{percentile(comparison.reply_ms.tolist(), 0.99):.2f}"
+        ),
+        f"within {CROSS_LIMIT_ARCSEC:.0f} and {ROLL_LIMIT_ARCSEC:.0f} arcsec": lambda comparison: (
+            "yes" if within_limits(comparison) else "NO"
         ),
     }
     for name, figure in figures.items():
-        table.add_row(name, *(figure(found) for found in comparisons.values()))
+        table.add_row(name, *(figure(comparison) for comparison in comparisons.values()))
     console.print(table)
-    return all(within_limits(found) for found in comparisons.values())
+    return all(within_limits(comparison) for comparison in comparisons.values())
 
 
 def main() -> int:

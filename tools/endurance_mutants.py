@@ -18,7 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
 MUTANTS = ROOT / "tests" / "hil_tests" / "endurance" / "mutants.toml"
-COPIED = ("starhil", "emulator", "protocol", "hil_tests", "configs", "starid")
+PACKAGES = ("starhil", "emulator", "protocol", "hil_tests", "configs", "starid")
 SEARCH = """
 import itertools, logging, sys, time
 from starhil.emulator.cli.endurance import run_once
@@ -57,7 +57,7 @@ def find(mutant: dict[str, str], minutes: float) -> str:
     """Return the processor time and the violation with which the defect was found, empty if it was not."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
-        for name in COPIED:
+        for name in PACKAGES:
             shutil.copytree(ROOT / name, copy / name, symlinks=True)
         plant(copy, mutant)
         environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}

@@ -114,17 +114,17 @@ def keep(name: str, target: Target, found: Path, scratch: Path) -> int:
         kind, number, *features = line.split()
         if kind == "FT" and features:
             reached[files[int(number)]] = set(features)  # those that no shorter input has
-    chosen: list[bytes] = []
+    corpus: list[bytes] = []
     left = CORPUS_BYTES
     for path in sorted(
         reached, key=lambda path: len(reached[path]) / (path.stat().st_size + 20), reverse=True
     ):
         data = path.read_bytes()
         if len(repr(data)) < left:
-            chosen.append(data)
+            corpus.append(data)
             left -= len(repr(data)) + 1
     CORPUS.mkdir(exist_ok=True)
-    (CORPUS / f"{name}.txt").write_text("".join(f"{data!r}\n" for data in sorted(chosen)), "ascii")
+    (CORPUS / f"{name}.txt").write_text("".join(f"{data!r}\n" for data in sorted(corpus)), "ascii")
     return CORPUS_BYTES - left
 
 
@@ -133,12 +133,12 @@ def fuzz(name: str, target: Target, kept: list[bytes], seconds: float) -> bool:
     FAILURES.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
-        found, log = scratch / "found", scratch / "log"
-        found.mkdir()
+        corpus, log = scratch / "found", scratch / "log"
+        corpus.mkdir()
         for number, data in enumerate([*target.seeds(), *kept]):
-            (found / f"seed{number}").write_bytes(data)
+            (corpus / f"seed{number}").write_bytes(data)
         before = set(FAILURES.glob(f"{name}-*"))
-        options = [f"-max_total_time={seconds:.0f}", "-print_final_stats=1", str(found)]
+        options = [f"-max_total_time={seconds:.0f}", "-print_final_stats=1", str(corpus)]
         begin, status = os.times(), in_child(target, options, log, f"{FAILURES}/{name}-")
         end, text = os.times(), log.read_text("utf-8", "replace")
         failures = sorted(set(FAILURES.glob(f"{name}-*")) - before)
@@ -148,7 +148,7 @@ def fuzz(name: str, target: Target, kept: list[bytes], seconds: float) -> bool:
                 print(f"{path}: {path.read_bytes()!r}", flush=True)
             return False
         units = re.search(r"number_of_executed_units: (\d+)", text)
-        size = keep(name, target, found, scratch)
+        size = keep(name, target, corpus, scratch)
     spent = end.children_user + end.children_system - begin.children_user - begin.children_system
     print(
         f"{name}: {int(units[1]) if units else 0:,} inputs in {spent:.0f} s, corpus {size} bytes", flush=True
@@ -156,14 +156,14 @@ def fuzz(name: str, target: Target, kept: list[bytes], seconds: float) -> bool:
     return True
 
 
-def measure_growth(wanted: list[str]) -> bool:
+def measure_growth(patterns: list[str]) -> bool:
     """Print for each channel the largest growth of calls and of time per byte; return whether the calls stay within the limit."""
     sys.path.insert(0, str(ROOT))
     from tests.fuzzing import growth
 
     good = True
     for name, channel in growth.channels().items():
-        if wanted and not any(fnmatch(name, pattern) for pattern in wanted):
+        if patterns and not any(fnmatch(name, pattern) for pattern in patterns):
             continue
         calls, times = [], []
         for label, small, large in growth.pairs(channel):
@@ -198,15 +198,15 @@ def main() -> None:
     targets = load_targets()
     from tests.fuzzing.targets import read_corpus
 
-    wanted = [
+    names = [
         name
         for name in targets
         if not options.targets or any(fnmatch(name, pattern) for pattern in options.targets)
     ]
-    if options.list or not wanted:
+    if options.list or not names:
         sys.exit("\n".join(targets) if options.list else "no such target; see --list")
-    failed = [name for name in wanted if not fuzz(name, targets[name], read_corpus(name), options.seconds)]
-    print(f"{len(wanted) - len(failed)} of {len(wanted)} targets without a failure {' '.join(failed)}")
+    failed = [name for name in names if not fuzz(name, targets[name], read_corpus(name), options.seconds)]
+    print(f"{len(names) - len(failed)} of {len(names)} targets without a failure {' '.join(failed)}")
     sys.exit(bool(failed))
 
 

@@ -107,12 +107,12 @@ def _solve(seed: int, defects: dict[str, Any]) -> tuple[float | None, float]:
     off = np.random.default_rng(seed).uniform(-0.9, 0.9) * TOLERANCE
     rough = Camera.from_fov(camera.fov_deg * (1.0 + off), camera.width, camera.height)
     begin = time.process_time()
-    found = solve_image(image, rough, sky, fov_tolerance=TOLERANCE)
+    result = solve_image(image, rough, sky, fov_tolerance=TOLERANCE)
     took = time.process_time() - begin
-    if not found.solution.valid:
+    if not result.solution.valid:
         return None, took
     middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
-    seen = found.solution.attitude.to_icrs(found.camera.back_project(middle))
+    seen = result.solution.attitude.to_icrs(result.camera.back_project(middle))
     true = truth.to_icrs(camera.back_project(middle))
     return float(np.linalg.norm(seen - true) * ARCSEC_PER_RAD), took
 

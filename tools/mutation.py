@@ -171,13 +171,13 @@ def tests_of(measured: dict, module: str, line: int) -> list[str]:
 
 def quickest(tests: Iterable[str], seconds: dict[str, float]) -> list[str]:
     """Return the quickest of some tests, as many as take TESTS_S together."""
-    chosen, spent = [], 0.0
+    selection, spent = [], 0.0
     for test in sorted(seconds.keys() & tests, key=seconds.__getitem__):
         spent += seconds[test]
         if spent > TESTS_S:
             break
-        chosen.append(test)
-    return chosen
+        selection.append(test)
+    return selection
 
 
 def change_functions(tree: ast.AST, line: int, module: str) -> bool:

@@ -403,7 +403,7 @@ class Attack:
         self._feed.sendto(self._next(worst_datagrams()), (host, int(port)))
 
 
-def worst(wanted: Sequence[str]) -> bool:
+def worst(names: Sequence[str]) -> bool:
     """Print the p99 of replies with and without the worst messages of each channel; return whether all is well.
 
     The OBC polls on the serial line, and on CAN while the serial line gets the messages.
@@ -425,7 +425,7 @@ def worst(wanted: Sequence[str]) -> bool:
         for obc in (on_serial, on_can):
             polled_ms(stack.enter_context(obc), rng)  # warm up
         for name, send in attack.channels.items():
-            if wanted and name not in wanted:
+            if names and name not in names:
                 continue
             obc = on_can if name == "serial" else on_serial
             without: list[float] = []

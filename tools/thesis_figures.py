@@ -85,12 +85,12 @@ def main() -> None:
     parser.add_argument("folder", type=Path, help="log folder of the session")
     folder: Path = parser.parse_args().folder
     truth = {row["frame"]: row for row in read(folder / "truth.csv")}
-    found = {
+    columns = {
         name: figures(read(path), truth) for name in CONDITIONS if (path := folder / f"{name}.csv").exists()
     }
-    table = Table("figure", *found)
-    for name in next(iter(found.values())):
-        table.add_row(name, *(f"{column[name]:.4g}" for column in found.values()))
+    table = Table("figure", *columns)
+    for name in next(iter(columns.values())):
+        table.add_row(name, *(f"{column[name]:.4g}" for column in columns.values()))
     Console(soft_wrap=True).print(table)
 
 

@@ -183,11 +183,11 @@ class FrameMaker:
             begun = time.perf_counter()
             result = self.sweep.solve(image, self.settings)
             return result.solution, len(result.detections.flux), begun
-        found = detect(image, self.settings)
+        detections = detect(image, self.settings)
         detected = time.perf_counter()
         return (
-            self.identifier.identify(found.xy_px, found.flux, found.position_errors),
-            len(found.flux),
+            self.identifier.identify(detections.xy_px, detections.flux, detections.position_errors),
+            len(detections.flux),
             detected,
         )
 

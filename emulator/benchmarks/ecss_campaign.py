@@ -133,8 +133,6 @@ class Condition:
 
 @dataclass
 class _FrameConditions:
-    """The conditions of one frame."""
-
     attitude: Attitude
     rate_rad_s: np.ndarray
     point: float | None = None

@@ -140,11 +140,11 @@ class _Nested:
         )
 
     def condition_variance(
-        self, known: Vectors | float = 0.0, known_dof: float = math.inf
+        self, pixel: Vectors | float = 0.0, pixel_dof: float = math.inf
     ) -> tuple[Vectors, Vectors]:
         """Return the variance of the conditions beyond a known variance, and the smallest significant value."""
-        dof = (self.cells - self.fields, min(self.total - self.cells, known_dof))
-        return _level(self.condition_ms, self.noise_ms + self.k1 * known, self.k1, dof)
+        dof = (self.cells - self.fields, min(self.total - self.cells, pixel_dof))
+        return _level(self.condition_ms, self.noise_ms + self.k1 * pixel, self.k1, dof)
 
     def field_variance(self, condition: Vectors) -> tuple[Vectors, Vectors]:
         """Return the field variance, corrected for the conditions, and the smallest significant value."""

@@ -21,7 +21,7 @@ _FALSE_STARS: Final = 100
 _FALSE_STAR_MAGNITUDES: Final = (1.0, 4.8)
 _PLANETS: Final = 3
 _PLANET_MAGNITUDES: Final = (-4.0, 1.5)
-_WITHIN_DEG: Final = 20.0
+_RADIUS_DEG: Final = 20.0
 _SUN_AWAY_DEG: Final = (30.0, 80.0)
 _SUN_STRAY_SHARE: Final = (1e-6, 3e-5)
 _COSMIC_RAYS_S: Final = 50.0
@@ -31,14 +31,14 @@ def hard_sky(attitude: Attitude, rng: np.random.Generator) -> SkyObjects:
     """Make a hard sky around an attitude: 100 false stars, 3 planets, particles, and the Moon in the field or glare of the Sun."""
     planets = tuple(
         PointSource(
-            *direction_around(attitude, (0.0, _WITHIN_DEG), rng), float(rng.uniform(*_PLANET_MAGNITUDES))
+            *direction_around(attitude, (0.0, _RADIUS_DEG), rng), float(rng.uniform(*_PLANET_MAGNITUDES))
         )
         for _ in range(_PLANETS)
     )
     moon, sun = None, None
     if rng.random() < 0.5:
         moon = Moon(
-            *direction_around(attitude, (0.0, _WITHIN_DEG), rng),
+            *direction_around(attitude, (0.0, _RADIUS_DEG), rng),
             illuminated=float(rng.uniform()),
             bright_limb_deg=float(rng.uniform(0.0, 360.0)),
         )

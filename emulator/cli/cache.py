@@ -63,26 +63,20 @@ def warm(
             help="Unit: a name or a folder; default: the profile's.", autocompletion=names_of("unit")
         ),
     ] = None,
-    scenario: Annotated[
-        str | None,
-        typer.Option(help="Scenario: a name or a TOML file.", autocompletion=names_of("scenario")),
-    ] = None,
 ) -> None:
     """Compile the kernels and build the star index, as the first start of a profile does.
 
-    Without a profile, a unit or a scenario: for all bundled profiles, and for all bundled units on the default profile.
+    Without a profile or a unit: for all bundled profiles, and for all bundled units on the default profile.
     Progress is shown on stderr.
     """
-    from starhil.emulator.control.scenario import load_scenario
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
     from starhil.emulator.run import Run
     from starhil.protocol.files.bundled import bundled, bundled_units
     from starid.storage.cache import cache_dir, kernels_written_since
 
     begin_s = time.time()
-    skies = [] if scenario is None else load_scenario(scenario).skies
     targets = [(profile or DEFAULT_PROFILE, unit)]
-    if profile is unit is scenario is None:
+    if profile is unit is None:
         targets += [(name, None) for name in bundled("profile") if name != DEFAULT_PROFILE]
         targets += [(DEFAULT_PROFILE, name) for name in bundled_units()]
     fixed = [
@@ -92,27 +86,24 @@ def warm(
         "links.can.channel=off",
         "links.canopen.node=0",
     ]
-    wanted = [
+    profiles = [
         load_profile(name, [*fixed, "run.state_dir=", *([] if of is None else [f"unit={of}"])])
         for name, of in targets
     ]
-    by_date = wanted[0].model_copy(update={"sky": {"bodies": "ephemeris"}})  # which has kernels of its own
 
     async def start(loaded: Profile) -> None:
         run = Run([loaded], previews=True)
         progress = asyncio.create_task(report_slow_start())
         try:
             await run.open()
-            run.heads[0].foreseen += skies
             run.begin()
             await run.ready()
         finally:
             progress.cancel()
             await run.close()
 
-    starts = [*(each for each in wanted if each.sky or len(wanted) > 1), by_date]
-    for number, each in enumerate(starts, 1):
-        log.info("%d of %d: %s, unit %s", number, len(starts), each.name, each.unit_source)
+    for number, each in enumerate(profiles, 1):
+        log.info("%d of %d: %s, unit %s", number, len(profiles), each.name, each.unit_source)
         asyncio.run(start(each))
     print(
         f"{kernels_written_since(begin_s)} kernels compiled in {time.time() - begin_s:.1f} s, in {cache_dir()}"

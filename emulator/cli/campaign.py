@@ -338,7 +338,7 @@ def algorithms(
         typer.Option(
             "--without",
             metavar="PART",
-            help="Take away a part of the thesis's algorithms: features, weights, motion or region.",
+            help="Take away a part of the thesis's algorithms: features, weights, filter, motion or region.",
         ),
     ] = None,
     as_json: AsJson = False,

@@ -97,13 +97,13 @@ def command(
     if life is not None:
         from starhil.protocol.unit import check_runs_no_code
 
-        found, again = read_life(life), f"--life {shlex.quote(str(life))}"
+        script, again = read_life(life), f"--life {shlex.quote(str(life))}"
         if plan.unit:
             (unit, *_) = plan.unit
-            found, again = replace(found, unit=unit), f"{again} --unit {shlex.quote(unit)}"
+            script, again = replace(script, unit=unit), f"{again} --unit {shlex.quote(unit)}"
         else:
-            check_runs_no_code(found.unit, f"--life {life}")
-        outcomes = [{**live(found, output), "repeat": again}]
+            check_runs_no_code(script.unit, f"--life {life}")
+        outcomes = [{**live(script, output), "repeat": again}]
     else:
         outcomes = list(_run(plan, output))
     figures = {"seed": plan.seed, **summary(outcomes)}

@@ -62,10 +62,10 @@ SUFFIXES: Final = {
 CHOICES: Final = {"bits": "`8`, `12`, `16`"}
 """Values of keys that are not all of a range."""
 
-OF_PARAMETERS: Final = ("exposure_s", "gain")
+PARAMETER_FIELDS: Final = ("exposure_s", "gain")
 """Fields of the sensor model that are parameters of the device, not keys of `[sensor]`."""
 
-LARGE: Final = 1e6
+EXPONENT_FROM: Final = 1e6
 """Numbers from here on are shown with an exponent if no digits are lost."""
 
 Row = tuple[str, ...]
@@ -98,7 +98,7 @@ def literal(value: object) -> str:
         return "`{ " + ", ".join(f"{key} = {json.dumps(item)}" for key, item in items) + " }`"
     if value is None or value in ({}, ""):
         return ""
-    if isinstance(value, float) and value >= LARGE and float(f"{value:g}") == value:
+    if isinstance(value, float) and value >= EXPONENT_FROM and float(f"{value:g}") == value:
         return f"`{value:g}`"
     plain = list(value) if isinstance(value, tuple) else value
     return f"`{json.dumps(plain, ensure_ascii=False)}`"
@@ -117,46 +117,46 @@ def attribute_docstrings(model: type, *, grouped: bool = False) -> dict[str, str
     SystemExit
         A field has no docstring; the message names it.
     """
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for kind in reversed(model.__mro__):
         if kind.__module__.startswith(("starhil.", "starid.")):
-            found |= {name: text or found.get(name, "") for name, text in _own_docstrings(kind).items()}
+            texts |= {name: text or texts.get(name, "") for name, text in _own_docstrings(kind).items()}
     if grouped:
         text = ""
-        for name in reversed(found):
-            text = found[name] = found[name] or text
-    bare = [name for name, text in found.items() if not text and not name.startswith("_")]
+        for name in reversed(texts):
+            text = texts[name] = texts[name] or text
+    bare = [name for name, text in texts.items() if not text and not name.startswith("_")]
     if bare:
         raise SystemExit(
             f"{model.__module__}.{model.__qualname__}.{bare[0]}: has no docstring; write one under it"
         )
-    return found
+    return texts
 
 
 def _own_docstrings(kind: type) -> dict[str, str]:
     """Return the docstring under each field that a class itself declares; empty if there is none."""
     module = ast.parse(textwrap.dedent(inspect.getsource(kind)))
     body = next(node.body for node in module.body if isinstance(node, ast.ClassDef))
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for statement, after in zip(body, [*body[1:], None], strict=True):
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
             text = after.value if isinstance(after, ast.Expr) else None
-            found[statement.target.id] = plain_text(str(text.value)) if isinstance(text, ast.Constant) else ""
-    return found
+            texts[statement.target.id] = plain_text(str(text.value)) if isinstance(text, ast.Constant) else ""
+    return texts
 
 
 def documented_names(item: Any) -> dict[str, str]:
     """Return name → description from the sections of a numpy docstring."""
     lines = inspect.cleandoc(item.__doc__ or "").splitlines()
-    found: dict[str, str] = {}
+    texts: dict[str, str] = {}
     names: list[str] = []
     for line, after in zip(lines, [*lines[1:], ""], strict=True):
         if line.startswith("    "):
             for name in names:
-                found[name] = f"{found.get(name, '')} {line.strip()}".strip()
+                texts[name] = f"{texts.get(name, '')} {line.strip()}".strip()
         elif line and not after.startswith("---"):
             names = [name.strip() for name in line.partition(" : ")[0].split(",")]
-    return {name: plain_text(text) for name, text in found.items()}
+    return {name: plain_text(text) for name, text in texts.items()}
 
 
 # --- pydantic models ---
@@ -263,11 +263,11 @@ def orbit() -> str:
 
 def alternatives(annotation: Any, key: str) -> Iterator[str]:
     """Yield the section of each model of a union, with its distinguishing first key in the heading."""
-    known: dict[Row, str] = {}
+    headings: dict[Row, str] = {}
     for model in models_in(annotation):
         title = f'{key} = "{kind_of(model)}"`'
-        own, shared = apart(model_rows(model)[1:], known)
-        known = {row: title.strip("`") for row in own} | known
+        own, shared = apart(model_rows(model)[1:], headings)
+        headings = {row: title.strip("`") for row in own} | headings
         parts = [f"### {title}", plain_text(model.__doc__ or ""), *shared]
         yield "\n\n".join([*parts, table(own)] if own else parts)
 
@@ -287,7 +287,7 @@ def sensor() -> str:
     """Keys of `[sensor]`."""
     from starhil.emulator.sensor.model import SensorModel
 
-    return table(dataclass_rows(SensorModel, OF_PARAMETERS))
+    return table(dataclass_rows(SensorModel, PARAMETER_FIELDS))
 
 
 def sky() -> str:
@@ -419,7 +419,7 @@ def unit_definition() -> str:
         "[[canopen.tpdo]], [[canopen.rpdo]]": canopen_schema.PdoModel,
     }
     parts: list[str] = []
-    known: dict[Row, str] = {}
+    titles: dict[Row, str] = {}
     for heading, model in headings.items():
         texts = attribute_docstrings(model)
         schema = model.model_json_schema()
@@ -430,8 +430,8 @@ def unit_definition() -> str:
             for key in (field.alias or name,)
             if f'{key} = "' not in heading
         ]
-        own, shared = apart(rows, known)
-        known = dict.fromkeys(own, heading) | known
+        own, shared = apart(rows, titles)
+        titles = dict.fromkeys(own, heading) | titles
         parts.append("\n\n".join([f"### `{heading}`", plain_text(model.__doc__ or ""), *shared]))
         if own:
             parts.append(table(own))
@@ -443,16 +443,16 @@ def unit_definition() -> str:
     return "\n\n".join(parts)
 
 
-def apart(rows: list[Row], known: Mapping[Row, str]) -> tuple[list[Row], list[str]]:
+def apart(rows: list[Row], headings: Mapping[Row, str]) -> tuple[list[Row], list[str]]:
     """Return rows without those that an earlier table has too, and a line for each earlier table with several of them."""
     elsewhere: dict[str, list[Row]] = {}
     for row in rows:
-        elsewhere.setdefault(known.get(row, ""), []).append(row)
+        elsewhere.setdefault(headings.get(row, ""), []).append(row)
     shared = {heading: same for heading, same in elsewhere.items() if heading and len(same) > 1}
     lines = [
         f"Also, as in `{heading}`: {', '.join(row[0] for row in same)}." for heading, same in shared.items()
     ]
-    return [row for row in rows if known.get(row) not in shared], lines
+    return [row for row in rows if headings.get(row) not in shared], lines
 
 
 def quantities() -> str:

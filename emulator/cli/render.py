@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
-from starhil.emulator.cli.options import names_of
+from starhil.emulator.cli.options import OrbitChoice, Settings, names_of, with_orbit
 from starhil.emulator.errors import EmulatorError
 from starid.cli.output import output_help, prepare_output, report_stream
 
@@ -119,6 +119,8 @@ def command(
             autocompletion=names_of("profile"),
         ),
     ] = None,
+    orbit: OrbitChoice = None,
+    overrides: Settings = None,
     as_annotated: Annotated[
         bool, typer.Option("--annotate", help="Stretch the image and mark the stars on it.")
     ] = False,
@@ -134,7 +136,10 @@ def command(
     prepare_output(output, "-o")
     if lens.fov is not None and not lens.fov >= _NARROWEST_DEG:
         raise EmulatorError(f"--fov {lens.fov:g}: must be at least {_NARROWEST_DEG:g} degrees")
-    camera, sensor, sky, catalog = _scene(profile)
+    settings = with_orbit(overrides, orbit)
+    if settings and profile is None:
+        raise EmulatorError("--set and --orbit: change the profile given by --profile; give both")
+    camera, sensor, sky, catalog = _scene(profile, settings)
     camera, sensor = lens.applied(camera), light.applied(sensor)
     renderer = Renderer(camera, catalog, sensor, seed, sky.objects)
     frame = renderer.render(
@@ -153,7 +158,7 @@ def command(
     typer.echo(text, file=report_stream(output))
 
 
-def _scene(profile: str | None) -> tuple[Camera, SensorModel, SkyView, StarCatalog]:
+def _scene(profile: str | None, settings: list[str]) -> tuple[Camera, SensorModel, SkyView, StarCatalog]:
     """Return camera, sensor, sky and catalogue of a profile; without one, the defaults and an empty sky."""
     from starhil.emulator.sensor.model import SensorModel
     from starhil.emulator.sensor.sky.objects import SkyObjects
@@ -170,7 +175,7 @@ def _scene(profile: str | None) -> tuple[Camera, SensorModel, SkyView, StarCatal
     from starhil.emulator.profile.pipeline_setup import pipeline_setup
     from starhil.protocol.unit import load_unit
 
-    loaded = load_profile(profile)
+    loaded = load_profile(profile, settings)
     icd = load_unit(loaded.unit_source)
     parameters = Parameters(icd, profile_defaults(loaded, icd))
     setup = pipeline_setup(loaded)

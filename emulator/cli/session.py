@@ -10,7 +10,14 @@ from typing import Annotated
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
-from starhil.emulator.cli.options import BenchOptions, checked_dialect, list_option, names_of
+from starhil.emulator.cli.options import (
+    BenchOptions,
+    OrbitChoice,
+    checked_dialect,
+    list_option,
+    names_of,
+    with_orbit,
+)
 from starid.cli.options import AsJson
 
 
@@ -24,6 +31,7 @@ def command(
     ],
     *,
     bench: BenchOptions,
+    orbit: OrbitChoice = None,
     log: Annotated[
         Path | None, typer.Option(help="Folder for logs, samples and images; default out/session/NAME.")
     ] = None,
@@ -45,10 +53,13 @@ def command(
     SIGHUP end the session and the emulator that it started; the remaining steps are reported as not run, and
     the exit status is 128 plus the signal's number.
     """
+    from starhil.hil_tests.errors import BenchError
     from starhil.hil_tests.rig.interruption import interruptible
     from starhil.hil_tests.rig.rig import LinkOptions
     from starhil.hil_tests.session import SessionRequest, run_session
 
+    if orbit is not None and not bench.start:
+        raise BenchError("--orbit needs --start: it changes the emulator's profile")
     links = LinkOptions(
         bench.serial,
         bench.can,
@@ -70,6 +81,7 @@ def command(
         keep_going,
         quiet=as_json,
         view=bench.view,
+        settings=tuple(with_orbit(None, orbit)),
     )
     with interruptible():
         result = run_session(request)

@@ -23,13 +23,13 @@ from starhil.emulator.console.trace import RequestEncoder, WireTrace
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Transition
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, one_line
 from starhil.emulator.links.table import LINKS
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.emulator.run import Run
 from starhil.emulator.run.head import Head
 from starhil.emulator.run.tape import LONGEST_NOTE, Note
-from starhil.emulator.simulation.guard import log_internal_error, one_line
+from starhil.emulator.simulation.guard import log_internal_error
 from starhil.emulator.simulation.threads import in_thread
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.errors import ProtocolError
@@ -467,7 +467,6 @@ def _count(request: dict[str, Any], key: str) -> int:
 
 
 def _table(request: dict[str, Any], key: str) -> dict[str, Any]:
-    """Return a table of a request."""
     value = request.get(key, {})
     if not isinstance(value, dict):
         raise EmulatorError(f"{key}: must be an object")

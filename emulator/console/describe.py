@@ -104,7 +104,6 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
 
 
 def _limit(number: float) -> float | str:
-    """Return a limit for JSON."""
     return json_integer(number) if isinstance(number, int) else number
 
 

@@ -125,11 +125,11 @@ class EventLog:
 
     def _faults_changed(self, request: dict[str, Any]) -> None:
         """Add what has begun and ended; faults that end by themselves, such as a reset, are in the request alone."""
-        active, asked = _by_name(self._head.faults.describe()), _by_name(request)
+        active, commands = _by_name(self._head.faults.describe()), _by_name(request)
         for name in self._faults:
             if name not in active:
                 self.add("fault", f"end: {name}", "good")
-        for name, value in (asked | active).items():
+        for name, value in (commands | active).items():
             if self._faults.get(name) != value and (name in active or json.loads(value)):
                 self.add("fault", f"begin: {name} {value}", "bad")
         self._faults = active
@@ -154,10 +154,10 @@ class EventLog:
 
 def _by_name(levels: dict[str, Any]) -> dict[str, str]:
     """Return the faults of all levels as JSON, by level and name; those of a level with a list have themselves as names."""
-    found: dict[str, str] = {}
+    faults: dict[str, str] = {}
     for level, content in levels.items():
         if isinstance(content, dict):
-            found |= {f"{level} {name}": json.dumps(value) for name, value in content.items()}
+            faults |= {f"{level} {name}": json.dumps(value) for name, value in content.items()}
         elif isinstance(content, list):
-            found |= {f"{level} {json.dumps(fault)}": "true" for fault in content}
-    return found
+            faults |= {f"{level} {json.dumps(fault)}": "true" for fault in content}
+    return faults

@@ -355,12 +355,14 @@ def recorded(
         writer.add_message(channel_id=channels[topic], log_time=at_ns, publish_time=at_ns, data=data)
 
     for row in rows:
-        known = {name: value for name, value in zip(COLUMNS, json_row(row), strict=True) if value is not None}
+        fields = {
+            name: value for name, value in zip(COLUMNS, json_row(row), strict=True) if value is not None
+        }
         add(
             "/measurement",
             "starhil.Measurement",
-            known["run_s"],
-            _named(known, reasons[int(known["reason"])]),
+            fields["run_s"],
+            _named(fields, reasons[int(fields["reason"])]),
         )
     for event in events:
         add("/events", "foxglove.Log", event.t, _log_entry(event))

@@ -18,7 +18,7 @@ from starhil.protocol.icd.codec import Field, Row
 from starhil.protocol.icd.values import Value
 from starhil.protocol.serial.cubespace import Dialect
 
-EXACT: Final = 2**53
+LARGEST_INTEGER: Final = 2**53
 """Integer up to which a page has all of them."""
 
 KEPT_STEPS: Final = 1000
@@ -219,7 +219,6 @@ class ConsoleObc:
 
 
 def _step_lines(step: SentStep) -> list[str]:
-    """Return the lines of one step."""
     telecommand = step.row.kind == "telecommand"
     lines = ["[[step]]", f"{'command' if telecommand else 'read'} = {toml(step.row.name)}"]
     if telecommand and step.data:
@@ -288,7 +287,7 @@ def json_value(value: Value) -> Any:
 
 def json_integer(value: int | bool) -> int | str:
     """Return an integer for JSON, as text if a page would round it."""
-    return value if abs(value) <= EXACT else str(value)
+    return value if abs(value) <= LARGEST_INTEGER else str(value)
 
 
 def exchange_content(exchange: Exchange) -> dict[str, Any]:

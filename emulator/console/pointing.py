@@ -22,7 +22,7 @@ _HIP: Final = re.compile(r"(?:HIP\s*)?(\d{1,9})", re.IGNORECASE)
 
 
 def pointing_request(
-    wanted: dict[str, Any],
+    motion: dict[str, Any],
     truth: dict[str, Any],
     mount: Attitude | None,
     catalog_path: str | None,
@@ -32,7 +32,7 @@ def pointing_request(
 
     Parameters
     ----------
-    wanted
+    motion
         `kind`: `slew`, `rate` or `fixed`. For `slew` and `fixed`, `to` has `star` (a name, or HIP and a
         number), or `ra_deg` and `dec_deg`; without `roll_deg`, the roll is kept. An empty `to` is the current
         attitude. `slew` also has `max_rate_deg_s`, and `rate` has `rate_deg_s`: three numbers, sensor frame.
@@ -49,17 +49,17 @@ def pointing_request(
     def of_body(sensor: Attitude) -> dict[str, Any]:
         return {"quaternion_xyzw": Attitude.from_matrix(to_body @ sensor.matrix).quaternion_xyzw.tolist()}
 
-    kind = wanted.get("kind")
+    kind = motion.get("kind")
     content: dict[str, Any] = {"attitude": of_body(here)}
     if kind == "rate":
-        rate = wanted.get("rate_deg_s")
+        rate = motion.get("rate_deg_s")
         if not isinstance(rate, list) or len(rate) != 3 or not all(map(is_number, rate)):
             raise EmulatorError("rate_deg_s: three numbers are needed")
         content["rate_deg_s"] = (to_body @ np.array(rate)).tolist()
     elif kind in ("slew", "fixed"):
-        target = of_body(_target(wanted.get("to") or {}, here, catalog_path, epoch))
+        target = of_body(_target(motion.get("to") or {}, here, catalog_path, epoch))
         if kind == "slew":
-            speed = wanted.get("max_rate_deg_s") or DEFAULT_RATE_DEG_S
+            speed = motion.get("max_rate_deg_s") or DEFAULT_RATE_DEG_S
             content["segments"] = [{"do": "slew", "to": target, "max_rate_deg_s": speed}]
         else:
             content["attitude"] = target
@@ -89,14 +89,12 @@ def _target(to: dict[str, Any], here: Attitude, catalog_path: str | None, epoch:
 
 def find_star(text: str, catalog_path: str | None, epoch: float) -> tuple[float, float]:
     """Return right ascension and declination, degrees, of a star by name or Hipparcos number."""
-    wanted = text.strip()
+    star = text.strip()
     named = {name.lower(): hip for hip, name in STAR_NAMES.items()}
-    number = _HIP.fullmatch(wanted)
-    hip = int(number[1]) if number is not None else named.get(wanted.lower())
+    number = _HIP.fullmatch(star)
+    hip = int(number[1]) if number is not None else named.get(star.lower())
     if hip is None:
-        raise EmulatorError(
-            f"star {wanted!r}: unknown; give a proper name such as Rigel, or HIP and a number"
-        )
+        raise EmulatorError(f"star {star!r}: unknown; give a proper name such as Rigel, or HIP and a number")
     catalog = load_catalog(catalog_path, epoch)
     rows = np.flatnonzero(catalog.hip == hip)
     if len(rows) == 0:

@@ -202,11 +202,11 @@ class ConsoleServer:
 
     def _console(self, request: web.Request) -> Console:
         """Return the console of the head that a request names; default: the first."""
-        wanted = request.query.get("head", "1")
-        known = {str(number): console for number, console in enumerate(self._consoles, start=1)}
-        if wanted not in known:
-            raise EmulatorError(f"head: must be 1 to {len(known)}, not {wanted!r}")
-        return known[wanted]
+        head = request.query.get("head", "1")
+        consoles = {str(number): console for number, console in enumerate(self._consoles, start=1)}
+        if head not in consoles:
+            raise EmulatorError(f"head: must be 1 to {len(consoles)}, not {head!r}")
+        return consoles[head]
 
     async def _static(self, request: web.Request) -> web.Response:
         """Return a file of the page, compressed."""

@@ -27,7 +27,7 @@ from starhil.protocol.serial.stack import SerialStack
 KEPT_ITEMS: Final = 20_000
 """Number of items kept for export."""
 
-DECODED: Final = 400
+DECODED_LINES: Final = 400
 """Number of latest items that are decoded; further items of a burst are only kept for export."""
 
 DECODED_AT_ONCE: Final = 20
@@ -65,7 +65,7 @@ class WireTrace:
         self._kept: deque[WireItem] = deque(maxlen=KEPT_ITEMS)
         self._decoder = Decoder(icd, dialect, objects)
         self._decoded_end = 0
-        self._lines: deque[tuple[int, str]] = deque(maxlen=DECODED)
+        self._lines: deque[tuple[int, str]] = deque(maxlen=DECODED_LINES)
         """The latest items that are decoded, as JSON, each with its number."""
         self._passed.connect(self._add)
 
@@ -89,10 +89,10 @@ class WireTrace:
 
     def decode(self) -> bool:
         """Decode some further items; return whether there are more."""
-        if self._count - self._decoded_end > DECODED:  # nobody has looked, or a burst
+        if self._count - self._decoded_end > DECODED_LINES:  # nobody has looked, or a burst
             self._decoder = Decoder(self._icd, self._dialect, self._objects)
             self._lines.clear()
-            self._decoded_end = self._count - DECODED
+            self._decoded_end = self._count - DECODED_LINES
         for number, item in self._items(range(self._decoded_end, self._decoded_end + DECODED_AT_ONCE)):
             self._lines.append((number, json.dumps({"n": number, **self._decoder.line(item)})))
             self._decoded_end = number + 1
@@ -123,7 +123,7 @@ class WireTrace:
         decoder = Decoder(self._icd, self._dialect, self._objects)
         parts: defaultdict[tuple[str, bool, int], list[bytes | CanFrame]] = defaultdict(list)
         """Items of messages that are not complete, by bus, direction and CAN ID."""
-        found: Request | Reply | None = None
+        message: Request | Reply | None = None
         pieces: list[bytes | CanFrame] = []
         for at, item in self._items(range(number - LEAD, number + 1)):
             key = item.bus, item.outgoing, item.item.id if isinstance(item.item, CanFrame) else 0
@@ -132,16 +132,16 @@ class WireTrace:
             if events or at == number:
                 pieces = parts.pop(key)
             if at == number and events and isinstance(events[-1], (Request, Reply)):
-                found = events[-1]
+                message = events[-1]
         frames = [str(piece) for piece in pieces if isinstance(piece, CanFrame)]
         raw = frames or [piece.hex(" ").upper() for piece in pieces if isinstance(piece, bytes)]
         content: dict[str, Any] = {"n": number, "raw": raw, "cansend": frames}
         content |= {"row": "", "data": "", "fields": [], "python": ""}
-        row = None if found is None else decoder.row_of(found)
-        if found is not None and row is not None:
-            fields = fields_of(row, found.data) if found.data else []
-            content |= {"row": row.name, "data": found.data.hex(" ").upper(), "fields": fields}
-            if isinstance(found, Request):
+        row = None if message is None else decoder.row_of(message)
+        if message is not None and row is not None:
+            fields = fields_of(row, message.data) if message.data else []
+            content |= {"row": row.name, "data": message.data.hex(" ").upper(), "fields": fields}
+            if isinstance(message, Request):
                 content["python"] = _python(row, fields)
         return content
 

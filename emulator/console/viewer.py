@@ -24,7 +24,7 @@ from starhil.emulator.console.history import History, Image
 QUEUE_LIMIT: Final = 1000
 """Send-queue limit; the oldest messages are dropped."""
 
-BEHIND: Final = 20
+WAIT_ABOVE: Final = 20
 """Number of queued messages above which the requests of a page wait."""
 
 BEAT_S: Final = 0.25
@@ -143,7 +143,7 @@ class Viewer:
     @property
     def behind(self) -> bool:
         """Whether the page reads more slowly than it is sent messages."""
-        return len(self._texts) > BEHIND
+        return len(self._texts) > WAIT_ABOVE
 
     def subscribe(self, *, frames: bool, wire: bool, history: int, events: int) -> None:
         """Set what the page shows; it has the rows of the history, and the events, before a number."""

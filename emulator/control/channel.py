@@ -324,12 +324,10 @@ class ControlServer:
             raise EmulatorError(f"wait: no exposure has begun within {within_s:g} s (mode {mode})")
 
     async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
-        wanted = await _parse(FaultRequest, request)
-        head.faults.check(wanted)
-        if wanted.optical is not None:
-            await head.prepare_sky(wanted.optical)
-        self._run.wiring.enter(NewFaults, request=wanted)
-        head.faults.inject(wanted)
+        fault = await _parse(FaultRequest, request)
+        head.faults.check(fault)
+        self._run.wiring.enter(NewFaults, request=fault)
+        head.faults.inject(fault)
         return {"faults": head.faults.describe()}
 
     async def _clear_faults(self, head: Head, _request: dict[str, Any]) -> Answer:
@@ -344,8 +342,6 @@ class ControlServer:
         async with self._opening:
             scenario = await in_thread(lambda: load_scenario(name))
             events = await in_thread(lambda: scenario.prepare(head, self._run.truth, start_s))
-        for sky in scenario.skies:
-            await head.prepare_sky(sky)
         head.device.scheduler.add(events)
         return {"events": len(events)}
 

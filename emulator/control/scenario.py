@@ -20,7 +20,7 @@ cannot set a live feed, because opening a socket takes time.
 from __future__ import annotations
 
 import logging
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Final, Self
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -90,11 +90,6 @@ class Scenario(Strict):
     """Name in messages."""
     at: Annotated[list[ScenarioEvent], Field(min_length=1, max_length=MAX_EVENTS)]
     """Events, in any order."""
-
-    @property
-    def skies(self) -> list[dict[str, Any]]:
-        """The optical faults of all events."""
-        return [each.fault.optical for each in self.at if each.fault is not None and each.fault.optical]
 
     def prepare(self, head: Head, truth: Truth | None, start_s: float = 0.0) -> list[tuple[int, Action]]:
         """Return the time of each event, nanoseconds, and its action; all files are read and checked now.

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Final, Literal, TypeAlias, TypeVar
+from typing import Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -274,8 +274,8 @@ class FrameCycle:
         """Return the request for the star index of the current parameters."""
         return IndexRequest(SolverSettings.of(self._parameters), self.upsets)
 
-    def rehearsals(self, constants: Mapping[str, Value], skies: Sequence[Mapping[str, Any]]) -> IndexRequest:
-        """Return the request to prepare frames with the present parameters, and with each of these optical faults.
+    def rehearsal(self, constants: Mapping[str, Value]) -> IndexRequest:
+        """Return the request to prepare frames with the present parameters.
 
         `constants` are parameters that the device is going to take from the camera.
         """
@@ -293,8 +293,7 @@ class FrameCycle:
             particles_s=conditions.particles_s,
             observer_velocity=self._assumed_velocity(now_ns),
         )
-        frames = tuple(replace(frame, faults=dict(sky)) for sky in skies)
-        return IndexRequest(settings, self.upsets, frames)
+        return IndexRequest(settings, self.upsets, frame)
 
     def single_frame(self, mid_ns: int) -> FrameRequest:
         """Return the request for an exposure that is not solved, with a given simulation time of mid-exposure."""

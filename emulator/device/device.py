@@ -24,12 +24,12 @@ from starhil.emulator.device.snapshot import Constants, Snapshot
 from starhil.emulator.device.state_store import StateStore
 from starhil.emulator.device.subscriptions import Subscriptions
 from starhil.emulator.device.surroundings import Surroundings
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, one_line
 from starhil.emulator.profile import Profile
 from starhil.emulator.sensor.pipeline.client import PipelineClient
 from starhil.emulator.sensor.pipeline.messages import IDENTITY, Quaternion
 from starhil.emulator.simulation.clock import Clock, DeviceTime
-from starhil.emulator.simulation.guard import log_internal_error, one_line
+from starhil.emulator.simulation.guard import log_internal_error
 from starhil.emulator.simulation.output_file import Output
 from starhil.emulator.simulation.scheduler import Event, Scheduler
 from starhil.emulator.truth.source import TruthSource
@@ -152,6 +152,10 @@ class Device:
             rate_fields=rate_fields(icd),
         )
         self._background = background
+        self._writing = False
+        """Whether the state is being written."""
+        self._unwritten: list[PendingAnswer[EmulatorError | None]] = []
+        """Answers to requests since the begin of that write."""
         self._boot_end: Event | None = None
         self._stored_parameters: dict[str, object] = {}
 
@@ -278,11 +282,30 @@ class Device:
             self.modes.fail("parameter_store")
 
     def _persist(self) -> PendingAnswer[EmulatorError | None]:
-        """Write the state to the store."""
-        content, written = self._persistent_state(), PendingAnswer[EmulatorError | None]()
+        """Write the state to the store.
+
+        Whoever asks during a write waits for the next one, which is the only one that waits: the bus can ask faster than
+        a disk writes, and the end of the run waits for all writes.
+        """
+        written = PendingAnswer[EmulatorError | None]()
         written.when_done(lambda error: None if error is None else self.stored.fail(str(error)))
-        self.write(lambda: self.store.save(content), written.end)
+        self._unwritten.append(written)
+        if not self._writing:
+            self._write_state()
         return written
+
+    def _write_state(self) -> None:
+        content, waiting = self._persistent_state(), self._unwritten
+        self._writing, self._unwritten = True, []
+
+        def done(error: EmulatorError | None) -> None:
+            self._writing = False
+            for written in waiting:
+                written.end(error)
+            if self._unwritten and not self._writing:
+                self._write_state()
+
+        self.write(lambda: self.store.save(content), done)
 
     def _persistent_state(self) -> dict[str, object]:
         """Return the state that survives a restart, including writes in progress."""

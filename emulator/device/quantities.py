@@ -124,7 +124,6 @@ def _star_direction(name: str, function: Callable[[Snapshot, MatchedStar], Tripl
 
 
 def _flag(name: str) -> None:
-    """Bind a flag of the links."""
     _quantity(f"link.{name}", lambda snapshot: name in snapshot.counters.flags)
 
 

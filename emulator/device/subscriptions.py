@@ -72,7 +72,6 @@ class Subscriptions:
         self._send(self._reporting("start"))
 
     def _reporting(self, event: str) -> list[Row]:
-        """Return the rows that report an event."""
         return [row for row, events in self._reports if event in events]
 
     def _mode_changed(self, change: Transition) -> None:

@@ -128,11 +128,11 @@ EFFECTS: Final = tuple(name for name in TelemetryFault.model_fields if name not 
 _DEFAULTS: Final = {
     name: TelemetryFault.model_fields[name].get_default(call_default_factory=True) for name in EFFECTS
 }
-OF_MESSAGES: Final = frozenset(
+MESSAGE_EFFECTS: Final = frozenset(
     ("answer_with", "wrong_id", "wrong_sequence", "wrong_check", "truncate", "duplicate", "drop")
 )
 """Those that concern the message around the data of a row, also of the answer to a telecommand."""
-SHOWN: Final = {"wrong_id": "id", "wrong_sequence": "sequence", "wrong_check": "check"}
+MESSAGE_PARTS: Final = {"wrong_id": "id", "wrong_sequence": "sequence", "wrong_check": "check"}
 """What the messages of a link must carry for an effect."""
 
 
@@ -168,13 +168,13 @@ class Injected:
 
     def seen(self, snapshot: Snapshot) -> Snapshot:
         """Return what the device believes instead of a snapshot."""
-        fault, held, frame = self.fault, self._held or snapshot, snapshot.frame
+        fault, past, frame = self.fault, self._held or snapshot, snapshot.frame
         if fault.freeze == "all":
-            return held
+            return past
         if frame is None:
             return snapshot
-        if fault.freeze == "attitude" and held.frame is not None:
-            frame = _with_attitude_of(held.frame, frame)
+        if fault.freeze == "attitude" and past.frame is not None:
+            frame = _with_attitude_of(past.frame, frame)
         if fault.turn_deg is not None:
             frame = _turned(frame, np.radians(fault.turn_deg))
         if fault.jump_deg:
@@ -267,25 +267,25 @@ class TelemetryFaults:
             if name is not None and name not in known:
                 what = "row" if key == "row" else "telemetry row"
                 raise EmulatorError(f"telemetry.{key}: no {what} named {name!r}{remedy(name, known)}")
-        for key, part in SHOWN.items():
+        for key, part in MESSAGE_PARTS.items():
             if key in fault.effects and not any(part in found for found in shown.values()):
                 links = " and ".join(shown) or "none"
                 raise EmulatorError(
                     f"telemetry.{key}: no link of this run ({links}) has a {_PARTS[part]} in its messages"
                 )
-        in_data = fault.effects - OF_MESSAGES
+        in_data = fault.effects - MESSAGE_EFFECTS
         if fault.row in icd.telecommands:
             if in_data:
                 text = f"{fault.row} is a telecommand, whose answer has no such data"
                 raise EmulatorError(f"telemetry.{min(in_data)}: {text}")
             return
-        chosen = [icd.telemetry[fault.row]] if fault.row is not None else list(icd.telemetry.values())
-        if fault.conjugate and not any(_vector_part(row) for row in chosen):
+        targets = [icd.telemetry[fault.row]] if fault.row is not None else list(icd.telemetry.values())
+        if fault.conjugate and not any(_vector_part(row) for row in targets):
             raise EmulatorError(f"telemetry.conjugate: {fault.row or icd.name} has no quaternion")
         for key, name, value in _by_field(fault):
-            fields = [row.named_fields[name] for row in chosen if name in row.named_fields]
+            fields = [row.named_fields[name] for row in targets if name in row.named_fields]
             if not fields:
-                names = {field for row in chosen for field in row.named_fields}
+                names = {field for row in targets for field in row.named_fields}
                 where = f"row {fault.row}" if fault.row is not None else f"no row of unit {icd.name}"
                 said = "has no" if fault.row is not None else "has a"
                 raise EmulatorError(f"telemetry.{key}: {where} {said} field {name!r}{remedy(name, names)}")
@@ -385,15 +385,15 @@ def _number_in(field: RowField, value: float) -> Value:
     return field.to_physical(raw)
 
 
-def _with_attitude_of(held: Measurement, frame: Measurement) -> Measurement:
+def _with_attitude_of(past: Measurement, frame: Measurement) -> Measurement:
     """Return a frame with the attitude of an earlier one."""
     return replace(
         frame,
-        result=held.result,
-        valid=held.valid,
-        reason=held.reason,
-        rate_rad_s=held.rate_rad_s,
-        rate_valid=held.rate_valid,
+        result=past.result,
+        valid=past.valid,
+        reason=past.reason,
+        rate_rad_s=past.rate_rad_s,
+        rate_valid=past.rate_valid,
     )
 
 

@@ -132,7 +132,6 @@ class Emulator:
                 truth = run.truth if head.number == 1 else None
                 events = await in_thread(scenario.prepare, head, truth)
                 head.device.scheduler.add(events)
-                head.foreseen += scenario.skies
         if options.control != "off" or options.console is not None:
             self.control = ControlServer(run, self.ended.set, options.control_token)
             if options.control != "off":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import resource
 import shutil
 import time
@@ -13,6 +14,7 @@ from typing import Any, ClassVar, Final, TypeVar
 
 from pydantic import TypeAdapter
 
+from starhil.emulator.device.device import PIPELINE_ENDED
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch.emulator import Emulator, RunOptions
@@ -43,8 +45,9 @@ DESCRIPTOR_LIMIT: Final = 4
 MEMORY_LIMIT_BYTES: Final = 64 * 2**20
 """A life may queue so many events, and add so many descriptors and bytes to those in use after its first power-on."""
 STATE_FOLDER: Final = "state"
-LONGEST_START_S: Final = 600.0
-"""Longest wall time for which a killed pipeline may take to be missed, or to be ready again, seconds."""
+LONGEST_STANDSTILL_S: Final = 120.0
+"""Wall time for which the successor of a killed pipeline may use no processor time before it is ready, seconds; a busy machine
+may let it wait, but not for so long."""
 TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
 
 
@@ -272,22 +275,30 @@ class UnitUnderTest:
         self.run.wiring.enter(ClearedFaults)
         self.head.faults.clear()
 
-    async def end_pipeline(self) -> None:
-        """End the image pipeline; a process is killed, and its successor awaited, which takes no simulation time."""
+    async def end_pipeline(self) -> bool:
+        """End the image pipeline; return whether it has been restarted.
+
+        A process is killed, and its successor awaited, which takes no simulation time, and as much other time as it needs.
+        """
         imager, device = self.head.imager, self.head.device
         if isinstance(imager, ErrorModel):
             imager.end("pipeline: ended by an endurance run")
-            return
+            return True
         if not isinstance(imager, WorkerClient) or not isinstance(imager.worker, WorkerProcess):
             raise EmulatorError("endurance: the pipeline is in a thread, which cannot be ended")
         imager.worker.process.kill()
         for ready in (False, True):
-            until_s = time.monotonic() + LONGEST_START_S
+            spent, since_s = -1.0, time.monotonic()
             while device.warm is not ready:
-                if time.monotonic() > until_s:
-                    raise EmulatorError("endurance: the pipeline has not been restarted")
+                if device.modes.error == PIPELINE_ENDED:
+                    return False
+                if (now_spent := _processor_time_s(imager.worker.process.pid)) != spent:
+                    spent, since_s = now_spent, time.monotonic()
+                if time.monotonic() - since_s > LONGEST_STANDSTILL_S:
+                    return False
                 await asyncio.sleep(WORKER_WAIT_S)
                 time.sleep(WORKER_WAIT_S)
+        return True
 
     def set_disk(self, *, full: bool) -> None:
         """Set whether this process can write to files; by the kernel, so that it concerns every writer."""
@@ -329,6 +340,15 @@ class UnitUnderTest:
         """Remove the log handler and the limit of files."""
         logging.getLogger("starhil.internal").removeHandler(self._errors)
         self.set_disk(full=False)
+
+
+def _processor_time_s(process: int) -> float:
+    """Return the processor time of a process, seconds; 0 if it has ended."""
+    try:
+        fields = Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def links_of(icd: InterfaceDefinition) -> tuple[str, ...]:

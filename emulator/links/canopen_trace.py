@@ -150,7 +150,6 @@ class CanopenDecoder:
         return f"{where} {name}"
 
     def _value(self, index: int, subindex: int, data: bytes) -> str:
-        """Return the value of an object as text."""
         try:
             variable = self._dictionary.find(index, subindex).variable
             size = type_size(variable.data_type)
@@ -167,7 +166,7 @@ class CanopenDecoder:
         """Return the objects of a PDO, which are those of its default mapping."""
         direction, number = PDOS[function]
         title = f"{'T' if direction is Direction.TRANSMIT else 'R'}PDO {number + 1}"
-        mapping, offset, found = direction.mapping(number), 0, []
+        mapping, offset, objects = direction.mapping(number), 0, []
         try:
             count = self._dictionary.find(mapping, 0).number()
             for slot in range(1, count + 1):
@@ -177,10 +176,10 @@ class CanopenDecoder:
                 offset += size
                 if len(part) == size:
                     variable = self._dictionary.find(entry.index, entry.subindex).variable
-                    found.append(f"{variable.name}={self._value(entry.index, entry.subindex, part)}")
+                    objects.append(f"{variable.name}={self._value(entry.index, entry.subindex, part)}")
         except SdoAbortError:
             return title
-        return f"{title} {' '.join(found)}".strip()
+        return f"{title} {' '.join(objects)}".strip()
 
 
 def _expedited(data: bytes) -> bytes:
@@ -189,6 +188,5 @@ def _expedited(data: bytes) -> bytes:
 
 
 def _abort(data: bytes) -> str:
-    """Return the reason of an abort."""
     (code,) = struct.unpack_from("<I", data, 4)
     return str(SdoAbortError(code))

@@ -190,11 +190,11 @@ PATHS: Final = profile_paths(Profile)
 _LONGEST_SHOWN: Final = 200
 """Longest part of a `--set` that an error repeats before it says what is wrong with it, characters."""
 
-_A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
+_FAULT_HINT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
 FAULT_KEY_HINTS: Final = dict.fromkeys(
     ("fault", "faults", "optical", "telemetry", "serial", "can", "stuck", "error", "reset", "upset", "clock", "phase", "drop", "corrupt",
      "junk", "delay_s", "split", "gap_s"),
-    _A_FAULT,
+    _FAULT_HINT,
 )  # fmt: skip
 """Keys of faults, which a profile does not have, and the hint for whoever writes one there."""
 ATTITUDE_KEY_HINTS: Final = {
@@ -271,7 +271,7 @@ def _problems_of_parameters(table: object, unit: Path) -> Iterator[tuple[Sequenc
     if not isinstance(table, dict):
         return
     try:
-        known = load_unit(unit).device_parameters
+        parameters = load_unit(unit).device_parameters
     except IcdError:
         return  # reported when the unit is loaded
     count = 0
@@ -280,19 +280,19 @@ def _problems_of_parameters(table: object, unit: Path) -> Iterator[tuple[Sequenc
             text = f"parameters: {len(table) - number} more keys are not checked; correct these first"
             yield ("parameters",), text
             return
-        for problem in _problems_of_parameter(known, name, value):
+        for problem in _problems_of_parameter(parameters, name, value):
             yield ("parameters", name), problem
             count += 1
 
 
-def _problems_of_parameter(known: Mapping[str, Parameter], name: str, value: Any) -> Iterator[str]:
-    if name not in known:
-        yield f"parameters.{name}: unknown key{remedy(name, known)}"
-    elif known[name].profile_key:
-        yield f"parameters.{name}: set {known[name].profile_key} instead"
+def _problems_of_parameter(parameters: Mapping[str, Parameter], name: str, value: Any) -> Iterator[str]:
+    if name not in parameters:
+        yield f"parameters.{name}: unknown key{remedy(name, parameters)}"
+    elif parameters[name].profile_key:
+        yield f"parameters.{name}: set {parameters[name].profile_key} instead"
     else:
         try:
-            known[name].check(value)
+            parameters[name].check(value)
         except ProtocolError as error:
             yield from (f"parameters.{problem}" for problem in error.problems)
 

@@ -13,13 +13,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
 from urllib.parse import quote
 
 from starhil.emulator.device.device import Background, Device, constants_to_adopt, outcome, run_at_once
@@ -51,9 +49,6 @@ from starhil.protocol.serial.cubespace import Dialect
 
 log = logging.getLogger("starhil.run")
 
-NOTICED_S: Final = 0.5
-"""Shortest time for which simulation time stands that is logged, seconds."""
-
 
 class Head:
     """One device of a run, with its pipeline, which is not started yet, and the truth of the body on which it is mounted.
@@ -81,15 +76,12 @@ class Head:
         self.traffic = Traffic()
         self.ready_fields: dict[str, str] = {}
         """Fields of the ready line: the opened ports and buses."""
-        self.foreseen: list[Mapping[str, Any]] = []
-        """Optical faults for which the pipeline is prepared at the start, such as those of a scenario."""
-        self._rehearsed: set[frozenset[str]] = set()
-        """Kinds of optical faults for which it is prepared."""
         self.warm: PipelineReady | None = None
         """What the pipeline reported when it was last ready; None before."""
         self._wiring = wiring
         self._on_warm = on_warm
         self._writer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="state")
+        self._writes: set[asyncio.Future[EmulatorError | None]] = set()
         self._pump: ClockPump | None = None
         self._warm_up_task: asyncio.Task[None] | None = None
         self._revival: PipelineRevival | None = None
@@ -126,10 +118,13 @@ class Head:
         loop = asyncio.get_running_loop()
 
         def background(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
-            def run() -> None:
-                loop.call_soon_threadsafe(done, outcome(work))
+            def ended(write: asyncio.Future[EmulatorError | None]) -> None:
+                self._writes.discard(write)
+                done(write.result())
 
-            self._writer.submit(run)
+            write = loop.run_in_executor(self._writer, outcome, work)
+            self._writes.add(write)
+            write.add_done_callback(ended)
 
         return background
 
@@ -166,7 +161,7 @@ class Head:
         try:
             warm = await self.imager.start()
             log.info("pipeline ready: %d stars, %.2f s", warm.stars, warm.seconds)
-            prepared = await self._rehearse(camera_constants(warm.camera), [{}, *self.foreseen])
+            prepared = await self._rehearse(camera_constants(warm.camera))
             self._record("ready")
             device.signals.mode_changed.connect(self._mode_changed)
             device.signals.restarted.connect(self._device_reset)
@@ -185,37 +180,13 @@ class Head:
         if self.clock.stepped or device.modes.mode is not Mode.BOOT:
             self._awake.set()
 
-    async def _rehearse(
-        self, constants: dict[str, Value], skies: Sequence[Mapping[str, Any]]
-    ) -> IndexRequest:
-        """Let the pipeline prepare frames under these optical faults, and wait until it has; return the request for their index."""
+    async def _rehearse(self, constants: dict[str, Value]) -> IndexRequest:
+        """Let the pipeline prepare frames, and wait until it has; return the request for their index."""
         device = self.device
-        adopted = constants_to_adopt(device.parameters, self.profile, constants)
-        self._rehearsed |= {_kinds_of(sky) for sky in skies}
-        request = device.cycle.rehearsals(adopted, skies)
+        request = device.cycle.rehearsal(constants_to_adopt(device.parameters, self.profile, constants))
         self.imager.prepare(request)
         await self.imager.settle()
-        return replace(request, rehearsals=())
-
-    async def prepare_sky(self, sky: Mapping[str, Any]) -> None:
-        """Prepare the pipeline for an optical fault of a kind that nobody foresaw: no frame is lost while kernels are compiled.
-
-        Meanwhile simulation time stands, on every clock.
-        """
-        if self.warm is None or _kinds_of(sky) in self._rehearsed or self.clock.stepped:
-            return
-        begun_s = time.monotonic()
-        held = self.clock.running.hold()
-        try:
-            await self._rehearse({}, [sky])
-        finally:
-            if held:
-                self.clock.start()
-        held_s = time.monotonic() - begun_s
-        if held_s > NOTICED_S:
-            log.info(
-                "optical fault: simulation time stood for %.1f s while the pipeline was prepared", held_s
-            )
+        return replace(request, rehearsal=None)
 
     def _record(self, kind: str) -> None:
         self._wiring.enter(PipelineState, do=kind)
@@ -280,15 +251,10 @@ class Head:
         await close_all(closers)
 
     async def _finish_writing(self) -> None:
-        """Wait for the writes in progress, and for their outcomes, which arrive in the event loop."""
+        """Wait for the writes in progress, and for those that follow from their outcomes, which arrive in the event loop."""
+        while self._writes:
+            await asyncio.wait(self._writes)
         self._writer.shutdown(wait=True)
-        await asyncio.sleep(0)
-
-
-def _kinds_of(sky: Mapping[str, Any]) -> frozenset[str]:
-    """Return the keys of an optical fault, and the keys in its tables."""
-    inner = {f"{name}.{key}" for name, table in sky.items() if isinstance(table, Mapping) for key in table}
-    return frozenset(sky) | inner
 
 
 async def _cancel(task: asyncio.Task[None]) -> None:

@@ -13,10 +13,9 @@ from collections.abc import Callable
 from typing import Final
 
 from starhil.emulator.device.device import PIPELINE_ENDED, Device
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, one_line
 from starhil.emulator.profile.pipeline_setup import SensorPipeline
 from starhil.emulator.sensor.pipeline.messages import PipelineReady
-from starhil.emulator.simulation.guard import one_line
 
 log = logging.getLogger("starhil.run")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -17,9 +17,9 @@ from starhil.emulator.sensor.noise import digitize
 from starhil.emulator.sensor.particle_hits import add_protons
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.rolling_shutter import at_row_times
+from starhil.emulator.sensor.sky.area_light import AreaLight, Backdrop
 from starhil.emulator.sensor.sky.ephemeris import Observer
-from starhil.emulator.sensor.sky.light import AreaLight, AreaPainter
-from starhil.emulator.sensor.sky.light_grid import Backdrop
+from starhil.emulator.sensor.sky.light import AreaPainter
 from starhil.emulator.sensor.sky.objects import PointSource, SkyObjects
 from starid.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask
 from starid.attitude import Attitude
@@ -37,9 +37,6 @@ _COMPANION_PX: Final = 2.0
 _OBJECT_STREAM: Final = 2
 _FLOOD_WELLS: Final = 10.0
 """Full wells of electrons in every pixel when light passes the baffle."""
-
-_BRIGHTER: Final = 4.0
-"""Electrons, over those that saturate a pixel, above which light need not be exact: also for pixels of low sensitivity."""
 
 _GLARE_SHARE: Final = 0.05
 """Glare below which none is drawn, as a share of the read noise."""
@@ -159,19 +156,6 @@ class Renderer:
         """The camera at the temperature of the frame."""
         self._work = np.zeros_like(self._still)
 
-    @cached_property
-    def _sensitivity(self) -> tuple[npt.NDArray[np.uint16], float]:
-        """Sensitivity (h, w) in 65535 steps, and one of them."""
-        step = max(float(self._pattern.sensitivity.max()), 1.0) / np.iinfo(np.uint16).max
-        return np.rint(self._pattern.sensitivity / np.float32(step)).astype(np.uint16), step
-
-    @cached_property
-    def _dark_roots(self) -> tuple[npt.NDArray[np.uint16], float]:
-        """Square roots (h, w) of the dark current at the reference temperature in 65535 steps, and electrons/s at one of them."""
-        step = max(math.sqrt(float(self._pattern.dark_e_s.max())), 1e-3) / np.iinfo(np.uint16).max
-        roots = np.sqrt(np.maximum(self._pattern.dark_e_s, 0.0)) / np.float32(step)
-        return np.rint(roots).astype(np.uint16), step**2
-
     def with_sensor(self, sensor: SensorModel) -> Renderer:
         """Return a renderer with another sensor; this one if the sensor is equal."""
         if sensor == self.sensor:
@@ -287,16 +271,9 @@ class Renderer:
         elif area.flooded:
             self._work.fill(_FLOOD_WELLS * self.sensor.full_well_e)
         else:
-            backdrop = Backdrop(
-                self._still,
-                *self._sensitivity,
-                dark=self._dark_roots[0],
-                dark_unit_e=self._dark_roots[1] * self.sensor.dark_factor(temperature_c) * exposure_s,
-                sky_e_s=float(self._sky_e_s),
-                exposure_s=exposure_s,
-                min_glare_e=_GLARE_SHARE * self.sensor.read_noise_e,
-                saturated_e=_BRIGHTER * self.sensor.saturation_dn * self.sensor.gain_e_per_dn,
-            )
+            least_e = _GLARE_SHARE * self.sensor.read_noise_e
+            sensitivity = self._pattern.sensitivity
+            backdrop = Backdrop(self._still, sensitivity, float(self._sky_e_s), exposure_s, least_e)
             area.draw(self._work, backdrop)
         return self._work
 

@@ -54,13 +54,6 @@ class ScaledClock:
         """Let time pass since a time of the monotonic wall clock, up to `limit_ns`; before this, it is zero."""
         self._origin_ns, self._limit_ns = wall_ns, limit_ns
 
-    def hold(self) -> bool:
-        """Let time stand until `start`, if it passes; return whether it did."""
-        passed = self._limit_ns is None
-        if passed:
-            self._limit_ns = self.now_ns()
-        return passed
-
     def start(self) -> None:
         """Let time pass without a limit."""
         self._origin_ns = time.monotonic_ns() - round(self.now_ns() / self.speed)
@@ -104,10 +97,6 @@ class SteppedClock:
 
     def switch_on(self, wall_ns: int, limit_ns: int) -> None:
         """Do nothing: time passes on request."""
-
-    def hold(self) -> bool:
-        """Return that time does not pass, because it does so on request."""
-        return False
 
     def start(self) -> None:
         """Do nothing: time passes on request."""

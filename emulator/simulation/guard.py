@@ -6,27 +6,16 @@ import asyncio
 import contextlib
 import inspect
 import logging
-import traceback
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import AsyncExitStack
 from typing import Any, Final, ParamSpec
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, one_line
 from starhil.protocol.errors import ProtocolError
 
 log: Final = logging.getLogger("starhil.internal")
 
 Arguments = ParamSpec("Arguments")
-
-
-def one_line(error: BaseException) -> str:
-    """Return type, text and origin of an unexpected error in one line."""
-    text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
-    frames = traceback.extract_tb(error.__traceback__)
-    if not frames:
-        return text
-    module = "/".join(frames[-1].filename.split("/")[-2:])
-    return f"{text} ({module}:{frames[-1].lineno})"
 
 
 def log_internal_error(what: str, error: Exception) -> None:

@@ -13,8 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-from starhil.emulator.errors import EmulatorError
-from starhil.emulator.simulation.guard import one_line
+from starhil.emulator.errors import EmulatorError, one_line
 
 log: Final = logging.getLogger("starhil.output")
 

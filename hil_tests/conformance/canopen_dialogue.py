@@ -90,7 +90,7 @@ from starhil.hil_tests.judge.canopen import ABORT, HEARTBEAT, SDO_RESPONSE, SEGM
 
 LONGEST_TIMEOUT_S: Final = 12.0
 """Maximum time in which a node aborts a transfer whose client stops sending."""
-NEEDED: Final = {"emcy": "emcy_id", "cause": "error", "fill-history": "error", "lss": "vendor"}
+NAMES_OF_VERBS: Final = {"emcy": "emcy_id", "cause": "error", "fill-history": "error", "lss": "vendor"}
 """Verb → name that it needs, found before the first request too."""
 ANSWERS: Final = {"abort", "unless", "segment", "block", "silence", "*", "-"}
 """First words of answers other than bytes."""
@@ -222,7 +222,7 @@ class CanopenDialogue(Dialogue[CanopenProbe]):
             if step.startswith("need "):
                 self._probe.require(*step.split()[1:])
         words = [word for step in steps for word in step.split()]
-        for name in (name for verb, name in NEEDED.items() if verb in words):
+        for name in (name for verb, name in NAMES_OF_VERBS.items() if verb in words):
             self._names[name]
         return self._names
 

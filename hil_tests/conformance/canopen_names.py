@@ -225,11 +225,16 @@ for _kind, _start in (("tpdo", TPDO), ("rpdo", RPDO)):
 
 @_finds("constant", "value", "no_subindex", "too_long")
 def _constant(probe: CanopenProbe) -> dict[str, str]:
-    """Return an object to transmit whose value is constant, if possible one that is mapped by default.
+    """Return an object to transmit whose value is constant, if possible one that accepts the value that it has.
 
-    As mapping entry; others have a sub-index that does not exist, and a byte too much.
+    A state in which the node happens to be, such as that of booting, cannot be set. As mapping entry; others have a sub-index
+    that does not exist, and a byte too much.
     """
-    fitting = (item for item in _settable(probe, FIRST_OWN_OBJECT) if size_of(item) in {1, 2, 4})
+    fitting = (
+        item
+        for item in _settable(probe, FIRST_OWN_OBJECT)
+        if size_of(item) in {1, 2, 4} and probe.write(item.index, item.subindex, probe.value(item)) == 0
+    )
     item = next(fitting, None) or probe.find(
         "object for a TPDO", lambda item: item.pdo_mappable and item.readable and bool(size_of(item))
     )

@@ -25,7 +25,7 @@ BOOT_S: Final = 0.6
 RECOVERY_S: Final = 15.0
 """Longest time from the end of the last fault to a valid attitude, with default parameters."""
 IMAGING: Final = frozenset({"lost_in_space", "tracking"})
-AT_START: Final = frozenset({"canopen_node"})
+START_PARAMETERS: Final = frozenset({"canopen_node"})
 """Parameters of which a new value takes effect at the next start of the unit; all others do at once."""
 SECOND_NS: Final = 1_000_000_000
 FLOAT_GRAIN: Final = {"f32": 1.2e-7, "f64": 4.5e-16}
@@ -106,7 +106,7 @@ class Oracle:
         """The unit has started at a time: at power-on, or by a restart of its own."""
         self._started_s: float | None = at_s
         self.values.update({**self._defaults, **self._stored})
-        self._at_start = {name: self.values[name] for name in AT_START}
+        self._at_start = {name: self.values[name] for name in START_PARAMETERS}
         self.modes = {"boot"}
         self.counts = {"telecommands": 0, "telemetry": 0}
         self._is_counted = not self.disk_full
@@ -166,7 +166,7 @@ class Oracle:
     def forget(self) -> None:
         """Parameters and counters are unknown from now on, because a request had an unknown outcome."""
         self.values.update(dict.fromkeys(self.values))
-        self._at_start = dict.fromkeys(AT_START)
+        self._at_start = dict.fromkeys(START_PARAMETERS)
         self._stored = dict.fromkeys(self.values)
         self.counts = dict.fromkeys(self.counts)
         self._clock = self._boot_count = self._selected = self._last = self._started_s = None
@@ -176,7 +176,7 @@ class Oracle:
 
     def in_use(self, name: str) -> Value | None:
         """Return the value of a parameter that the unit works with, None if it is not known."""
-        known = (self._at_start if name in AT_START else self.values)[name]
+        known = (self._at_start if name in START_PARAMETERS else self.values)[name]
         return None if known is None else known[0]
 
     # --- requests ---
@@ -278,7 +278,7 @@ class Oracle:
                 self.bursts = True
             case "subscribe":
                 self._subscribed = True
-            case action if action not in _WITHOUT_EFFECT:
+            case action if action not in _INERT_ACTIONS:
                 self.forget()
 
     def _arguments(self, row: Row, data: bytes) -> dict[str, Any]:
@@ -326,17 +326,19 @@ class Oracle:
             if data != self._frozen.setdefault(row.name, data):
                 raise Violation(f"{row.name}: changes, although it is frozen")
             return
-        given = fault.get("set", {})
+        overrides = fault.get("set", {})
         by_quantity: Readings = {}
         for name, value in row.decode(data).items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise Violation(f"{row.name}.{name}: {value}")
-            if name not in given:
+            if name not in overrides:
                 by_quantity[row.named[name].quantity] = (row.named[name], value)
-            elif value != given[name]:
-                raise Violation(f"{row.name}.{name}: {value!r}, although a fault sets it to {given[name]!r}")
+            elif value != overrides[name]:
+                raise Violation(
+                    f"{row.name}.{name}: {value!r}, although a fault sets it to {overrides[name]!r}"
+                )
         self.judge(row.name, by_quantity)
-        if not any(row.named[name].quantity.startswith("attitude.") for name in given):
+        if not any(row.named[name].quantity.startswith("attitude.") for name in overrides):
             self.judge_attitude(row.name, by_quantity)
 
     def judge(self, name: str, read: Readings) -> None:
@@ -454,7 +456,6 @@ class Oracle:
         return None if self._started_s is None else self.now_s - self._started_s
 
     def _check_fraction(self, quantity: str, where: str, _field: Field, value: Value) -> None:
-        """Check the part of a second."""
         expected_s = self._uptime_s() if quantity.startswith("uptime") else self._clock_s()
         if expected_s is None or isinstance(value, (str, bytes)):
             return
@@ -479,7 +480,7 @@ _TIMING: Final = frozenset({"update_rate", "exposure", "delay_time"})
 _ORBIT: Final = frozenset({"orbit_semi_major_axis", "orbit_eccentricity"})
 _BOUND: Final = _TIMING | _ORBIT | {"min_star_pixels", "max_star_pixels"}
 """Parameters that bound each other, so that a value within its limits may be refused."""
-_WITHOUT_EFFECT: Final = frozenset(
+_INERT_ACTIONS: Final = frozenset(
     [
         None,
         "nothing",

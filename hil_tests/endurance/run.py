@@ -140,7 +140,8 @@ class LifeRun:
             self._obc.connect()
 
     async def _end_pipeline(self) -> None:
-        await self._unit.end_pipeline()
+        if not await self._unit.end_pipeline():
+            raise Violation("the image pipeline has not been restarted")
         self._oracle.failed()
 
     async def _disk(self, *, full: bool) -> None:

@@ -49,8 +49,8 @@ class LiveUnit(Protocol):
     def clear_faults(self) -> None:
         """End all faults."""
 
-    async def end_pipeline(self) -> None:
-        """End the image pipeline unexpectedly."""
+    async def end_pipeline(self) -> bool:
+        """End the image pipeline unexpectedly; return whether the unit has restarted it."""
 
     def set_disk(self, *, full: bool) -> None:
         """Set whether files can be written."""

@@ -56,6 +56,8 @@ class SessionRequest:
     quiet: bool = False
     view: str | None = None
     """Address of the console that shows the results; `auto` with `start`: the started emulator's."""
+    settings: tuple[str, ...] = ()
+    """Settings of the started emulator, which those of the script override."""
 
 
 def find_script(path: Path) -> Path:
@@ -131,23 +133,23 @@ def _asks_for_an_emulator(script: Script) -> bool:
 
 def start_command(script: Script, folder: Path) -> str:
     """Return the command that starts an emulator for a script."""
-    wanted = script.emulator
-    settings = pointed(script.truth.attitude, wanted.settings)
-    words = ["starhil", "run", *([wanted.profile] if wanted.profile else [])]
+    emulator = script.emulator
+    settings = pointed(script.truth.attitude, emulator.settings)
+    words = ["starhil", "run", *([emulator.profile] if emulator.profile else [])]
     words += [word for setting in settings for word in ("--set", setting)]
-    words += [] if wanted.seed is None else ["--seed", str(wanted.seed)]
+    words += [] if emulator.seed is None else ["--seed", str(emulator.seed)]
     words += [] if script.truth.file is None else ["--truth-log", str(folder / script.truth.file)]
     return shlex.join([*words, "--control", "auto"])
 
 
 def _check_emulator(path: Path, script: Script, rig: Rig, folder: Path) -> None:
     """Raise BenchError if the emulator that runs is not the one that a script is for: its profile, its clock, where it looks."""
-    status, wanted = rig.control("status", {}), script.emulator
+    status, emulator = rig.control("status", {}), script.emulator
     problems = []
     if status["clock"] == "stepped":
         problems.append("its clock is stepped, on which a session waits for ever")
-    if wanted.profile and status["profile"] != Path(wanted.profile).stem:
-        problems.append(f"its profile is {status['profile']}, not {Path(wanted.profile).stem}")
+    if emulator.profile and status["profile"] != Path(emulator.profile).stem:
+        problems.append(f"its profile is {status['profile']}, not {Path(emulator.profile).stem}")
     if status["mode"] in ("boot", "error"):
         problems.append(f"its mode is {status['mode']}")
     if script.truth.attitude is not None:
@@ -275,7 +277,7 @@ def _emulator(
             can=options.can or "off",
             dialect=options.dialect,
             seed=section.seed,
-            settings=pointed(script.truth.attitude, section.settings),
+            settings=[*request.settings, *pointed(script.truth.attitude, section.settings)],
             state_dir=state,
             truth_log=truth_log,
             extra=extra,

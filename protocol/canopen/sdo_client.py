@@ -16,7 +16,7 @@ SdoTransfer = Generator[bytes, bytes, bytes]
 
 _ABORT: Final = 0x80
 _SEGMENT: Final = 7
-_ACCEPTED: Final = bytes(8)
+_CONFIRMATION: Final = bytes(8)
 _EXECUTE: Final = b"\x01"
 """Written to the entry of a telecommand that has no data."""
 
@@ -85,7 +85,7 @@ def requests_of(transfer: SdoTransfer) -> list[bytes]:
     requests = [next(transfer)]
     with suppress(StopIteration):
         while True:
-            requests.append(transfer.send(_ACCEPTED))
+            requests.append(transfer.send(_CONFIRMATION))
     return requests
 
 

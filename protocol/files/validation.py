@@ -179,12 +179,12 @@ def wording(item: ErrorDetails, *, suggest: bool = True) -> str:
 def _choice(item: ErrorDetails, models: Sequence[type[BaseModel]], suggest: bool) -> list[str]:
     """Return the text of an error in the key that selects one of several models."""
     context = item["ctx"]
-    given = f" (given: {context['tag']!r})" if "tag" in context else ""
+    note = f" (given: {context['tag']!r})" if "tag" in context else ""
     expected = context.get("expected_tags") or ", ".join(
         sorted(repr(tag) for each in models for tag in _tags_of(each))
     )
     names = re.findall("'([^']*)'", expected) if suggest else ()
-    return [f"must be one of {expected}{given}{did_you_mean(str(context.get('tag', '')), names)}"]
+    return [f"must be one of {expected}{note}{did_you_mean(str(context.get('tag', '')), names)}"]
 
 
 def _along(

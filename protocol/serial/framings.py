@@ -191,7 +191,7 @@ class Slip(Framing):
         return self._before + escaped + self.end
 
     def bodies(self, text: bytes) -> Iterator[bytes | LinkFault]:
-        """Yield the body of the bytes between two end bytes, or its fault."""
+        """Yield the body of the bytes between two end bytes, if there are any, or its fault."""
         body, *rest = text.split(self.escape)
         for piece in rest:
             original = self._originals.get(piece[0]) if piece else None
@@ -200,7 +200,8 @@ class Slip(Framing):
                 yield LinkFault(FaultKind.UART_PROTOCOL, f"{found} after an escape byte within a message")
                 return
             body += original + piece[1:]
-        yield body
+        if text:
+            yield body
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
         """Return a deframer for the messages between end bytes."""
@@ -208,7 +209,7 @@ class Slip(Framing):
 
 
 class _DelimitedDeframer(_Collector[_Message]):
-    """Divides the stream at each end; text longer than `limit` is junk up to the next end, and none between two ends is nothing."""
+    """Divides the stream at each end; text longer than `limit` is junk up to the next end."""
 
     def __init__(self, receiving: Receiving[_Message], framing: Slip | Delimited, limit: int) -> None:
         super().__init__(receiving)
@@ -231,7 +232,7 @@ class _DelimitedDeframer(_Collector[_Message]):
             return False
         text = bytes(self._buffer[:size])
         self._drop(size + len(end))
-        for body in () if self._in_junk or not text else self._framing.bodies(text):
+        for body in () if self._in_junk else self._framing.bodies(text):
             if isinstance(body, LinkFault):
                 self._add(body)
             else:

@@ -42,8 +42,8 @@ LIMIT2: Final = 12
 
 _MAX_ITERATIONS: Final = 60
 _MAX_HALVINGS: Final = 40
-_CONVERGED: Final = 1e-13
-_ACCEPTED: Final = 1e-10
+_RESIDUAL: Final = 1e-13
+_MAX_RESIDUAL: Final = 1e-10
 _SERIES_BELOW: Final = 1e-4
 _TINY: Final = 1e-150
 
@@ -128,7 +128,7 @@ def undistort(params: Array, a: float, b: float) -> tuple[float, float, bool]:
     residual = math.hypot(ra, rb)
     scale = 1.0 + math.hypot(a, b)
     for _ in range(_MAX_ITERATIONS):
-        if residual <= _CONVERGED * scale:
+        if residual <= _RESIDUAL * scale:
             break
         j11, j12, j22 = distort_slopes(params, u, v)
         determinant = j11 * j22 - j12 * j12
@@ -150,7 +150,7 @@ def undistort(params: Array, a: float, b: float) -> tuple[float, float, bool]:
             fraction *= 0.5
         if not better:
             break
-    return u, v, residual <= _ACCEPTED * scale
+    return u, v, residual <= _MAX_RESIDUAL * scale
 
 
 @inner_checked

@@ -63,8 +63,11 @@ def aberrated(directions: ArrayLike, velocity_m_s: ArrayLike) -> Array:
         Velocity of the observer, ICRS, m/s; its negative inverts the transformation.
     """
     p, beta = np.asarray(directions, dtype=np.float64), checked_beta(velocity_m_s)
-    inverse_gamma = math.sqrt(1.0 - float(beta @ beta))
-    along = (p @ beta)[..., None]
+    u, v, w = beta.tolist()
+    inverse_gamma = math.sqrt(1.0 - (u * u + v * v + w * w))
+    along = (p[..., 0] * u + p[..., 1] * v + p[..., 2] * w)[
+        ..., None
+    ]  # BLAS would sum as the processor likes
     seen: Array = inverse_gamma * p + (1.0 + along / (1.0 + inverse_gamma)) * beta
     seen /= 1.0 + along
     return seen

@@ -203,7 +203,6 @@ class _Progress:
 
 
 def _unix_time(date: str) -> float:
-    """Return the Unix time of `--date`."""
     from starid.catalog.earth import unix_time
 
     try:

@@ -57,7 +57,7 @@ class Fit(Protocol):
 FIT: Final = record_type(Fit)
 
 _ITERATIONS: Final = 12
-_FAR_MORE: Final = 1.8
+_PIXEL_RATIO: Final = 1.8
 SHARP_SIGMA_PX: Final = 0.5
 """Standard deviation of a spot above which a single pixel does not look like a star."""
 
@@ -252,7 +252,7 @@ def fit_star(
     if flux <= 0.0 or by_shape < least_signal * least_signal:
         result.state = FAINT
         return
-    if least_signal > 0.0 and shape[0] > SHARP_SIGMA_PX and by_pixel > _FAR_MORE * by_shape:
+    if least_signal > 0.0 and shape[0] > SHARP_SIGMA_PX and by_pixel > _PIXEL_RATIO * by_shape:
         result.state = HOT_PIXEL
         return
     sums = work[4]

@@ -51,8 +51,8 @@ from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
 from starid.imaging.trail_flow import trail_shifts
 from starid.imaging.windows import (
+    DUPLICATE,
     MIN_SPREAD_PX,
-    SEEN_BEFORE,
     WINDOW,
     cut_windows,
     lay_windows,
@@ -526,7 +526,7 @@ def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detecti
     fits = _with_companions(fits, settings.blend_px)
     states = fits.stars["state"]
     good = np.flatnonzero(states == GOOD)
-    again = (states == TWICE) | (fits.windows["columns"] == SEEN_BEFORE)
+    again = (states == TWICE) | (fits.windows["columns"] == DUPLICATE)
     rejected = len(states) - good.size - int(np.count_nonzero(again)) + hot
     if good.size == 0:
         return _no_detections(background, "nothing on the image has the shape of a star", rejected)

@@ -46,7 +46,7 @@ _EDGE_SIGMA: Final = 2.5
 BAD_FIT: Final = 4.0
 """Smallest reduced χ² of a bad fit."""
 
-_AT_REST: Final = 0.5
+_REST_CHI2_SHARE: Final = 0.5
 _STRAY_SIGMA: Final = 7.0
 _STRAY_DISTANCE_SIGMA: Final = 2.0
 FIT_PARAMETERS: Final = 3
@@ -147,7 +147,7 @@ def _is_at_rest(
     if star.state != GOOD or star.chi2 <= bad or math.hypot(shape[1], shape[2]) <= SHORT_TRAIL_PX:
         return False
     fit_star(pixels, bounds, (star.x, star.y), (shape[0], 0.0, 0.0), noise, 0.0, model, work, spot)
-    return bool(spot.state == GOOD and spot.chi2 <= min(bad, _AT_REST * star.chi2))
+    return bool(spot.state == GOOD and spot.chi2 <= min(bad, _REST_CHI2_SHARE * star.chi2))
 
 
 @compiled_ieee

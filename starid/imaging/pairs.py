@@ -25,7 +25,7 @@ _ITERATIONS: Final = 25
 _CONVERGED_PX: Final = 2e-3
 _MAX_STEP_PX: Final = 0.4
 _MAX_CHANGE: Final = 0.5
-_BETTER: Final = 0.5
+_CHI2_SHARE: Final = 0.5
 _HOPEFUL_STEPS: Final = 10
 """Steps after which the fit is abandoned unless it is better than the fit of one star."""
 
@@ -37,7 +37,7 @@ _PAIR_SIGMA: Final = 2.5
 _FAR_SIGMA: Final = 4.0
 _CORE_SIGMA: Final = 1.0
 _ONE_PIXEL: Final = 0.5
-_DOUBTFUL: Final = 1.4
+_MERGER_SHARE: Final = 1.4
 """Pairs closer than this many blending distances may be merged in the catalogue (off axis, an angle has more pixels)."""
 
 
@@ -201,7 +201,7 @@ def _first_guesses(
 def _is_better(pair: Records, chi2: float, sigma: float, models: Array, pixels: Array32) -> bool:
     """Whether two stars fit much better than one, and neither is noise or a single pixel."""
     apart = math.hypot(pair[0].x - pair[1].x, pair[0].y - pair[1].y)
-    if pair[0].chi2 > _BETTER * chi2 or apart < _CLOSEST_SIGMA * sigma:
+    if pair[0].chi2 > _CHI2_SHARE * chi2 or apart < _CLOSEST_SIGMA * sigma:
         return False
     total = pair[0].flux + pair[1].flux
     for k in range(2):
@@ -242,7 +242,7 @@ def doubt_close_pairs(stars: Records, order: Indices, blend_px: float) -> None:
     blend_px : float
         See `split_pairs`.
     """
-    reach = _DOUBTFUL * blend_px
+    reach = _MERGER_SHARE * blend_px
     for place in range(order.size):
         one = stars[order[place]]
         for later in range(place + 1, order.size):
@@ -360,7 +360,7 @@ def split_pairs(
         if not _first_guesses(left_over, bounds, star, sigma, pair):
             continue
         noises = (window.noise**2, per_dn, model_error)
-        enough = _BETTER * star.chi2
+        enough = _CHI2_SHARE * star.chi2
         fitted = fit_pair(target, bounds, shape, noises, models, work, enough, pair)
         if not fitted or not _is_better(pair, star.chi2, sigma, models, target):
             continue

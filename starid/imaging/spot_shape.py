@@ -22,16 +22,16 @@ from starid.kernels.jit import compiled_ieee
 MOMENT_COLUMNS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
 _ITERATIONS: Final = 30
-_SETTLED: Final = 1e-2
+_CHANGE_SHARE: Final = 1e-2
 _WEIGHT_END: Final = 12.0
 _MIN_FOR_SPOT: Final = 3
 _ROUND_BELOW_PX: Final = 1.0
 _MIN_SIGMA_PX: Final = 0.3
-_UNEXPLAINED: Final = 0.4
+_MISMATCH_SHARE: Final = 0.4
 _LONG_PX: Final = 2.5
 _MIN_LONG: Final = 6
-_AGREES: Final = 0.3
-_MAX_AGREE: Final = 0.5
+_AGREEMENT_SHARE: Final = 0.3
+_AGREEING_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def adaptive_moments(
         n_xy = 2.0 * (m_xy / total - m_x * m_y)
         n_yy = 2.0 * (m_yy / total - m_y * m_y)
         change = abs(n_xx - c_xx) + abs(n_yy - c_yy) + abs(n_xy - c_xy)
-        settled = change < _SETTLED * (c_xx + c_yy)
+        settled = change < _CHANGE_SHARE * (c_xx + c_yy)
         c_xx, c_xy, c_yy = max(n_xx, 0.05), n_xy, max(n_yy, 0.05)
         if abs(x - x0) > largest or abs(y - y0) > largest:
             return False
@@ -216,7 +216,7 @@ def shape_from_moments(
         fit_flow(positions, trails, flow)
         lengths, off = lengths_and_mismatches(flow, positions, trails)
         typical = median(lengths)
-        if typical > _ROUND_BELOW_PX and median(off) < _UNEXPLAINED * median(length):
+        if typical > _ROUND_BELOW_PX and median(off) < _MISMATCH_SHARE * median(length):
             return SpotShape(_sigma(across, known_sigma_px), flow, typical, len(table))
     return SpotShape(_sigma(median(mean), known_sigma_px), still, 0.0, len(table))
 
@@ -242,10 +242,14 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
     longest = table[long_trails(table, shape.sigma_px)]
     if len(longest) < _MIN_LONG:
         return shape
-    found = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
+    trail = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
     positions, trails, length = _trails(longest, width, height, shape.sigma_px**2 + _PIXEL_VARIANCE)
-    agree = np.count_nonzero(lengths_and_mismatches(found.flow, positions, trails)[1] < _AGREES * length)
-    return found if found.trail_px > 0.0 and agree >= max(_MIN_LONG, _MAX_AGREE * len(longest)) else shape
+    agree = np.count_nonzero(
+        lengths_and_mismatches(trail.flow, positions, trails)[1] < _AGREEMENT_SHARE * length
+    )
+    return (
+        trail if trail.trail_px > 0.0 and agree >= max(_MIN_LONG, _AGREEING_SHARE * len(longest)) else shape
+    )
 
 
 def _mean_and_split(table: Array) -> tuple[Array, Array]:

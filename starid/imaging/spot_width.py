@@ -19,7 +19,7 @@ _LARGEST_HALF_WIDTH: Final = 28
 _ROUNDS: Final = 8
 _STEP: Final = 0.02
 _MAX_CHANGE: Final = 0.3
-_SETTLED: Final = 0.01
+_CHANGE_SHARE: Final = 0.01
 _MODEL_ERROR: Final = 0.02
 
 
@@ -84,7 +84,7 @@ def _one_width(
         sigma += change
         if not NARROWEST_PX <= sigma <= WIDEST_PX:
             return math.nan
-        if abs(change) < _SETTLED * sigma:
+        if abs(change) < _CHANGE_SHARE * sigma:
             return sigma
     return math.nan
 

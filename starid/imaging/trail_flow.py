@@ -21,11 +21,11 @@ from starid.kernels.jit import compiled_ieee
 from starid.kernels.small_arrays import copy_values, median
 
 FLOW_TERMS: Final = 5
-_TRANSLATION: Final = 2
-_WITH_ROLL: Final = 3
+_TRANSLATION_TERMS: Final = 2
+_ROLL_TERMS: Final = 3
 _MIN_FOR_ROLL: Final = 5
 _MIN_FOR_FLOW: Final = 12
-_STARTS_FROM: Final = 7
+_START_STARS: Final = 7
 _CLIP: Final = 3.0
 _MIN_CLIP_PX: Final = 0.1
 _ROUNDS: Final = 4
@@ -211,7 +211,7 @@ def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
     right = np.empty(FLOW_TERMS)
     rows = np.empty((2, FLOW_TERMS))
     start = np.zeros(FLOW_TERMS)
-    few = min(count, _STARTS_FROM)
+    few = min(count, _START_STARS)
     flow[:] = 0.0
     least = math.inf
     for i in range(few):
@@ -221,14 +221,16 @@ def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
                 senses[i] = 1.0
                 if j > i:
                     senses[j] = sense
-                terms = _WITH_ROLL if j > i else _TRANSLATION
+                terms = _ROLL_TERMS if j > i else _TRANSLATION_TERMS
                 if not _least_squares(positions, trails, senses, terms, matrix, right, rows, start):
                     continue
                 left = _mean_mismatch(start, positions, trails)
                 if left < least:
                     least = left
                     copy_values(start, flow)
-    used = _TRANSLATION if count < _MIN_FOR_ROLL else _WITH_ROLL if count < _MIN_FOR_FLOW else FLOW_TERMS
+    used = (
+        _TRANSLATION_TERMS if count < _MIN_FOR_ROLL else _ROLL_TERMS if count < _MIN_FOR_FLOW else FLOW_TERMS
+    )
     off, ordered = np.empty(count), np.empty(count)
     for _ in range(_ROUNDS):
         for k in range(count):

@@ -66,7 +66,7 @@ MIN_SPREAD_PX: Final = 0.5
 """Smallest standard deviation of a spot, pixels, for the light of a star to reach more than one pixel."""
 
 EXTENDED: Final = -1
-SEEN_BEFORE: Final = -2
+DUPLICATE: Final = -2
 NO_ROOM: Final = -3
 ONE_PIXEL: Final = -4
 """`columns` of candidates without a window."""
@@ -312,7 +312,7 @@ def lay_windows(
         patch[0], patch[1], patch[2] = column, row, 0.0
         if image[row, column] >= saturation:
             if _in_patches(column, row, patches, patch_count):
-                window.columns = SEEN_BEFORE
+                window.columns = DUPLICATE
                 continue
             if not _saturated_patch(image, column, row, saturation, visited, stack, patch):
                 window.columns = EXTENDED

@@ -28,7 +28,7 @@ from starid.photograph.views import View, views
 
 _log = logging.getLogger(__name__)
 
-_FEW: Final = 8
+_MIN_FOR_LENS: Final = 8
 """Smallest number of matched stars for estimating the lens."""
 
 SCHEDULE: Final[tuple[tuple[int, int | None], ...]] = ((0, None), (1, None), (2, None), (3, None), (4, 1))
@@ -231,7 +231,7 @@ def refine_solution(
     if view.mirrored:
         detections = dataclasses.replace(detections, xy_px=flipped(detections.xy_px, camera.width))
     refined = solution.camera or camera
-    if solution.star_count >= _FEW:
+    if solution.star_count >= _MIN_FOR_LENS:
         stars = Stars(detections.xy_px, detections.flux, detections.xy_sigma_px)
         refined = _refined(stars, solution, refined, camera, identifier.catalog.aberrated(observer_velocity))
     again = identifier.with_camera(refined).track(

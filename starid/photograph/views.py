@@ -37,7 +37,7 @@ _SMOOTHING_TAPS: Final = 9
 _SAMPLED_PX: Final = 200_000
 _QUIET_SHARE: Final = 25.0
 _FAR_SIGMAS: Final = 4.0
-_LONGER: Final = 2
+_TAIL_RATIO: Final = 2
 _MAD_TO_SIGMA: Final = 1.4826
 
 
@@ -134,7 +134,7 @@ def has_dark_tail(image: GreyImage) -> bool:
     deviation = image.astype(np.float32) - np.float32(middle)
     sigma = max(_MAD_TO_SIGMA * float(np.median(np.abs(deviation))), 0.5)
     far = _FAR_SIGMAS * sigma
-    return int(np.count_nonzero(deviation < -far)) > _LONGER * int(np.count_nonzero(deviation > far))
+    return int(np.count_nonzero(deviation < -far)) > _TAIL_RATIO * int(np.count_nonzero(deviation > far))
 
 
 def _coarser(image: GreyImage, factor: int, settings: DetectionSettings) -> Detections:

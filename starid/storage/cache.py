@@ -13,7 +13,7 @@ import stat
 import sys
 import tempfile
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -48,8 +48,7 @@ def cache_dir() -> Path:
     they are read, so a folder to which others can write is not used (`insecurity`): a warning is logged, and the
     folder under the temporary folder is used instead, or if that is not secure either, one of this process alone.
     """
-    chosen, own = _chosen_folder(), Path(tempfile.gettempdir()) / f"starhil-cache-{_user()}"
-    for folder in dict.fromkeys((chosen or own, own)):
+    for folder in _folders():
         with contextlib.suppress(OSError, ValueError):
             folder.mkdir(_PRIVATE, parents=True, exist_ok=True)
         problem = insecurity(folder)
@@ -57,6 +56,18 @@ def cache_dir() -> Path:
             return folder
         _warn_not_used(folder, problem)
     return _folder_of_process()
+
+
+def _folders() -> Iterator[Path]:
+    """Yield the folders that may be used, the first choice first.
+
+    The temporary folder is only looked for if the first is none: where no disk has room, there is no temporary folder.
+    """
+    chosen = _chosen_folder()
+    if chosen is not None:
+        yield chosen
+    with contextlib.suppress(FileNotFoundError):
+        yield Path(tempfile.gettempdir()) / f"starhil-cache-{_user()}"
 
 
 def _chosen_folder() -> Path | None:
@@ -202,7 +213,6 @@ def cached_files() -> list[CachedFile]:
 
 
 def _size_of_folder(folder: Path) -> int:
-    """Bytes of the files in a folder and the folders in it."""
     return sum(path.stat().st_size for path in folder.rglob("*") if not path.is_dir())
 
 

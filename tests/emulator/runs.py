@@ -12,7 +12,14 @@ from starhil.emulator.simulation.signal import Signal
 from starhil.protocol.messages import ErrorCode, Request
 from tests.waiting import until
 
-CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
+CAMERA = {
+    "width": 937,
+    "height": 937,
+    "model": "pinhole",
+    "focal_px": [1220.0, 1220.0],
+    "centre_px": [468.0, 468.0],
+    "distortion": [0.0] * 5,
+}
 
 
 class DirectImager:

@@ -31,3 +31,11 @@ def test_a_profile_is_read_without_them(profile: str) -> None:
     text = "import sys; from starhil.emulator.profile import load_profile; load_profile(sys.argv[1]); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", text, profile], capture_output=True, text=True, check=True)
     assert not set(FOR_THE_WORKER) & set(done.stdout.split())
+
+
+def test_the_pipeline_starts_without_the_libraries_of_the_links() -> None:
+    text = "import sys, starhil.emulator.sensor.pipeline.pipeline, starhil.emulator.sensor.pipeline.worker; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert not {"asyncio", "ssl", "pydantic", "typer", "can", "canopen", "construct"} & set(
+        done.stdout.split()
+    )

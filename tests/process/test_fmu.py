@@ -106,6 +106,17 @@ def simulate(path: Path, inputs: np.ndarray, step_s: float = STEP_S) -> np.ndarr
     )  # fmt: skip
 
 
+def test_an_exported_orbit_is_a_start_value(tmp_path: Path) -> None:
+    target = tmp_path / "leo.fmu"
+    assert run_command_line("fmu", "export", "--orbit", "leo", "-o", str(target)) == (0, "", "")
+    description = fmpy.read_model_description(str(target))
+    (orbit,) = (each for each in description.modelVariables if each.name == "orbit")
+    assert orbit.start == "leo"
+    done = run_command_line("fmu", "export", "--orbit", "moon", "-o", str(target))
+    assert done[0] != 0
+    assert "leo" in done[2]
+
+
 def test_the_descriptions_pass_the_schema_of_the_standard_and_the_rules_of_fmpy(
     fmu2: Path, fmu3: Path
 ) -> None:

@@ -125,8 +125,8 @@ def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tm
     text = (
         "import sys, time\n"
         "from starhil.emulator.cli.app import main\n"
-        "from starhil.emulator.truth import config\n"
-        f"config.read_truth_file = lambda *_: (open({str(reading)!r}, 'w').close(), time.sleep(1e6))\n"
+        "from starhil.emulator.truth import reading_process\n"
+        f"reading_process.read_truth_file = lambda *_: (open({str(reading)!r}, 'w').close(), time.sleep(1e6))\n"
         f"sys.argv[1:] = ['run', 'demo', '--serial', 'off', '--can', 'off', '--control', 'unix:{control}']\n"
         "sys.exit(main())\n"
     )

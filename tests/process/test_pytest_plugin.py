@@ -61,6 +61,8 @@ def test_one(starhil_serial, starhil_control, starhil_truth):
     starhil_serial.set_parameter("exposure", 150)
     starhil_serial.command("set_mode", mode="lost_in_space")
     starhil_control.do("fault", optical={"blocked_share": 1.0})
+    starhil_control.do("fault", clock={"jump_s": -5.0, "drift_ppm": 50.0})
+    starhil_control.do("fault", telemetry=[{"row": "precise_attitude", "jump_deg": 3.0}])
     starhil_truth.set(kind="fixed", attitude={"ra_deg": 10.0, "dec_deg": 20.0})
     assert starhil_control.do("truth")["ra_deg"] == pytest.approx(10.0)
 

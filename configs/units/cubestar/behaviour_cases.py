@@ -61,14 +61,14 @@ STORE: Final = CaseArea[LinkProbe]("store", rule(16), intrusive=True)
 def acknowledge_accepted(probe: LinkProbe) -> None:
     for name, values in (("select_parameter", {"parameter": 1}), ("clear_counters", {})):
         probe.command(name, **values)
-        seen = probe.telemetry("acknowledge")
-        wanted = {
+        reply = probe.telemetry("acknowledge")
+        content = {
             "last_telecommand": probe.unit.telecommands[name].id,
             "processed": True,
             "error": "ok",
             "parameter_index": 0,
         }
-        check_equal(seen, wanted, "acknowledge")
+        check_equal(reply, content, "acknowledge")
 
 
 @ACKNOWLEDGE.case("unknown", "after an unknown telecommand: its ID and invalid_id")
@@ -214,7 +214,6 @@ def time_set(probe: LinkProbe) -> None:
 
 @contextmanager
 def _kept_clock(probe: LinkProbe) -> Iterator[None]:
-    """Restore the clock afterwards."""
     before, began = _clock(probe), probe.now()
     try:
         yield
@@ -323,18 +322,18 @@ def valid_attitude(probe: LinkProbe) -> None:
     standby(probe)
     probe.command("set_mode", mode="lost_in_space")
     end = probe.now() + 20.0
-    while not (seen := probe.telemetry("precise_attitude"))["valid"]:
+    while not (attitude := probe.telemetry("precise_attitude"))["valid"]:
         if probe.now() > end:
             standby(probe)
             raise CaseSkipped("no attitude was found within 20 s: no stars in view?")
         probe.sleep(0.1)
     clock = float(probe.telemetry("device_status")["clock"])
-    length = sum(float(seen[key]) ** 2 for key in ("q_x", "q_y", "q_z", "q_w")) ** 0.5
+    length = sum(float(attitude[key]) ** 2 for key in ("q_x", "q_y", "q_z", "q_w")) ** 0.5
     check(abs(length - 1.0) < 1e-5, "a quaternion of length 1", f"{length:.7f}")
-    check(float(seen["q_w"]) >= 0.0, "scalar part not negative", seen["q_w"])
-    check_equal(seen["reason"], "ok", "reason")
-    check(int(seen["stars_matched"]) >= 3, "three stars or more", seen["stars_matched"])
-    age = clock - float(seen["time_of_exposure"])
+    check(float(attitude["q_w"]) >= 0.0, "scalar part not negative", attitude["q_w"])
+    check_equal(attitude["reason"], "ok", "reason")
+    check(int(attitude["stars_matched"]) >= 3, "three stars or more", attitude["stars_matched"])
+    age = clock - float(attitude["time_of_exposure"])
     check(0.0 <= age <= 5.0, "time of exposure up to 5 s ago", f"{age:.3f} s")
     probe.command("set_mode", mode="standby")
 
@@ -420,12 +419,12 @@ def store_defaults(probe: LinkProbe) -> None:
 def star_config(probe: LinkProbe) -> None:
     row = probe.unit.telecommands["set_star_config"]
     before = probe.telemetry("star_config")
-    wanted = {**before, "exposure": 140, "max_stars_matched": 40}
-    probe.command("set_star_config", **wanted)
-    check_equal(probe.telemetry("star_config"), wanted, "star_config")
+    config = {**before, "exposure": 140, "max_stars_matched": 40}
+    probe.command("set_star_config", **config)
+    check_equal(probe.telemetry("star_config"), config, "star_config")
     check_equal(value_of(probe, "exposure"), 140.0, "parameter exposure")
-    bad = bytearray(row.encode({**wanted, "exposure": 160}))
+    bad = bytearray(row.encode({**config, "exposure": 160}))
     bad[row.named["max_stars_matched"].offset] = 0
     probe.expect_refusal(row, bytes(bad), INVALID_PARAMETER)
-    check_equal(probe.telemetry("star_config"), wanted, "star_config after a refusal")
+    check_equal(probe.telemetry("star_config"), config, "star_config after a refusal")
     probe.command("set_star_config", **before)

@@ -108,11 +108,11 @@ def _burst(probe: LinkProbe, count: int, *, everything: bool) -> list[tuple[int,
 def block(probe: LinkProbe) -> None:
     _save(probe)
     _load(probe, 0, 990)
-    wanted = probe.telemetry("file_block")["checksum"]
+    checksum = probe.telemetry("file_block")["checksum"]
     packets = _burst(probe, 50, everything=True)
     check_equal([number for number, _ in packets], list(range(50)), "numbers")
     data = b"".join(part for _, part in packets)
-    check_equal(crc_hqx(data[:990], CRC_START), wanted, "checksum")
+    check_equal(crc_hqx(data[:990], CRC_START), checksum, "checksum")
 
 
 @BURSTS.case("holes", "with a hole map, only missing packets are sent")
@@ -203,7 +203,6 @@ def one_by_one(probe: LinkProbe) -> None:
 
 
 def _files(probe: LinkProbe) -> list[dict[str, Value]]:
-    """Return the list of files."""
     probe.command("reset_file_list")
     files: list[dict[str, Value]] = []
     while len(files) < MAX_FILES:

@@ -62,12 +62,12 @@ def _unsolicited_rows(probe: LinkProbe, name: str, rate: float, seconds: float) 
 @UNSOLICITED.case("rate", "unsolicited telemetry is sent at its rate, and stops")
 def unsolicited(probe: LinkProbe) -> None:
     row = probe.unit.telemetry["identification"]
-    seen = _unsolicited_rows(probe, "identification", 10.0, 2.0)
+    messages = _unsolicited_rows(probe, "identification", 10.0, 2.0)
     if not probe.has_unsolicited:
-        check(not seen, "no unsolicited telemetry on this link", f"{len(seen)} messages")
+        check(not messages, "no unsolicited telemetry on this link", f"{len(messages)} messages")
         return
-    check(18 <= len(seen) <= 22, "18 to 22 messages in 2 s", len(seen))
-    check_equal({(item.row_id, len(item.data)) for item in seen}, {(row.id, row.size)}, "row and length")
+    check(18 <= len(messages) <= 22, "18 to 22 messages in 2 s", len(messages))
+    check_equal({(item.row_id, len(item.data)) for item in messages}, {(row.id, row.size)}, "row and length")
     after = probe.receive_unsolicited(0.5)
     check(len(after) <= 1, "no more", f"{len(after)} messages")
 
@@ -75,13 +75,13 @@ def unsolicited(probe: LinkProbe) -> None:
 @UNSOLICITED.case("long", "a long row is sent complete as unsolicited telemetry")
 def unsolicited_long(probe: LinkProbe) -> None:
     row = probe.unit.telemetry["star_tracker"]
-    seen = _unsolicited_rows(probe, "star_tracker", 5.0, 1.0)
+    messages = _unsolicited_rows(probe, "star_tracker", 5.0, 1.0)
     if not probe.has_unsolicited:
-        check(not seen, "no unsolicited telemetry on this link", f"{len(seen)} messages")
+        check(not messages, "no unsolicited telemetry on this link", f"{len(messages)} messages")
         return
-    check(len(seen) >= 3, "3 messages or more in 1 s", len(seen))
-    check_equal({(item.row_id, len(item.data)) for item in seen}, {(row.id, row.size)}, "row and length")
-    for item in seen:
+    check(len(messages) >= 3, "3 messages or more in 1 s", len(messages))
+    check_equal({(item.row_id, len(item.data)) for item in messages}, {(row.id, row.size)}, "row and length")
+    for item in messages:
         checked_values(row, item.data)
 
 
@@ -98,9 +98,11 @@ def unsolicited_segments(probe: CanProbe) -> None:
     probe.command("set_unsolicited", telemetry=COMBINED, rate=5.0)
     try:
         probe.receive_unsolicited(1.0)
-        seen = probe.unsolicited[:8]
+        frames = probe.unsolicited[:8]
     finally:
         probe.command("set_unsolicited", telemetry=COMBINED, rate=0.0)
-    check_equal([frame.id >> 24 for frame in seen], [10, *[11] * 6, 12], "types")
-    check_equal([frame.data[-1] if frame.data else -1 for frame in seen], list(range(7, -1, -1)), "counters")
-    check_equal(sum(len(frame.data) - 1 for frame in seen), COMBINED_SIZE, "bytes")
+    check_equal([frame.id >> 24 for frame in frames], [10, *[11] * 6, 12], "types")
+    check_equal(
+        [frame.data[-1] if frame.data else -1 for frame in frames], list(range(7, -1, -1)), "counters"
+    )
+    check_equal(sum(len(frame.data) - 1 for frame in frames), COMBINED_SIZE, "bytes")

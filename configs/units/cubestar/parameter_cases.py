@@ -39,11 +39,11 @@ def _parameter_cases(item: Parameter) -> Iterator[Case[LinkProbe]]:
     clause = f"configs/units/cubestar parameter {item.name}; {rule(19)}"
 
     def limits(probe: LinkProbe) -> None:
-        seen = parameter(probe, item.name)
-        check_equal(seen["parameter"], item.id, "number")
+        reply = parameter(probe, item.name)
+        check_equal(reply["parameter"], item.id, "number")
         for key, wanted in (("minimum", item.minimum), ("maximum", item.maximum)):
-            check_equal(seen[key], float(wanted), key)
-        value = float(seen["value"])
+            check_equal(reply[key], float(wanted), key)
+        value = float(reply["value"])
         check(item.value_of(value) is not None, f"a value within {item.minimum:g} to {item.maximum:g}", value)
 
     def refusals(probe: LinkProbe) -> None:

@@ -84,12 +84,12 @@ def received(probe: SerialProbe, sent: bytes) -> Sequence[Message]:
         if len(probe.raw) > size:
             size, since = len(probe.raw), probe.now()
             continue
-        found = bodies(bytes(probe.raw))
-        ended = bool(found) and probe.raw.endswith(b"\xc0") and bool(found[-1][2:3] > b"\x7f")
+        pieces = bodies(bytes(probe.raw))
+        ended = bool(pieces) and probe.raw.endswith(b"\xc0") and bool(pieces[-1][2:3] > b"\x7f")
         if ended or not polled or probe.now() - since > probe.times.answer_s:
             break
     messages = []
-    for body in found:
+    for body in pieces:
         check(body[:2] == bytes((OBC, TRACKER)), f"addresses {OBC:02X} {TRACKER:02X}", body[:2].hex(" "))
         check(crc(body[:-2]) == body[-2:], f"CRC {crc(body[:-2]).hex(' ')}", body[-2:].hex(" "))
         messages.append(Message(body[2], body[3:-2]))
@@ -249,17 +249,17 @@ def solved(probe: SerialProbe) -> bytes:
 
 @COMBINED.case("quaternion", "the quaternion has length 1, its scalar part first", COPY.format(35922))
 def quaternion(probe: SerialProbe) -> None:
-    found = struct.unpack("<I4d", solved(probe))[1:]
-    check(abs(sum(part * part for part in found) - 1.0) < 1e-9, "length 1", found)
+    components = struct.unpack("<I4d", solved(probe))[1:]
+    check(abs(sum(part * part for part in components) - 1.0) < 1e-9, "length 1", components)
     truth = probe.truth() if probe.truth is not None else None
     if truth is not None:
         x, y, z, w = truth
         # A(q) is the conjugate of the rotation of vectors
-        product = abs(w * found[0] - x * found[1] - y * found[2] - z * found[3])
+        product = abs(w * components[0] - x * components[1] - y * components[2] - z * components[3])
         check(
             product > 1.0 - 1e-5,
             f"scalar part {w:.6f} first, then {-x:.6f} {-y:.6f} {-z:.6f}, or all negative",
-            found,
+            components,
         )
 
 

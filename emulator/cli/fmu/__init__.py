@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from starhil.emulator.cli.options import ProfileArgument
+from starhil.emulator.cli.options import OrbitChoice, ProfileArgument, with_orbit
 from starhil.emulator.cli.output import writing
 from starid.cli.options import one_of
 from starid.cli.output import output_help
@@ -24,6 +24,7 @@ def export(
     output: Annotated[Path, typer.Option("--output", "-o", help=output_help("The FMU."))] = Path(
         "startracker.fmu"
     ),
+    orbit: OrbitChoice = None,
     fmi: Annotated[str, typer.Option(help="Version of FMI: 3 or 2, which older tools read.")] = "3",
 ) -> None:
     """Export an FMU for co-simulation, with its binary (Linux x86-64) and its source; this needs a C compiler.
@@ -36,10 +37,12 @@ def export(
 
     one_of("--fmi", fmi, ("2", "3"))
     name = profile or DEFAULT_PROFILE
-    load_profile(name)
-    where = str(Path(name).absolute()) if name.endswith(".toml") else name
+    load_profile(name, with_orbit(None, orbit))
+    where, around = (
+        str(Path(each).absolute()) if each.endswith(".toml") else each for each in (name, orbit or "")
+    )
     with writing(output):
-        export_fmu(output, where, installed_command(), cast("Fmi", fmi))
+        export_fmu(output, where, around, installed_command(), cast("Fmi", fmi))
 
 
 @group.command(hidden=True)

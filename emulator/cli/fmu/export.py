@@ -24,20 +24,20 @@ BINARIES: Final[dict[Fmi, str]] = {"2": "binaries/linux64", "3": "binaries/x86_6
 FLAGS: Final = ("-std=gnu11", "-O2", "-Wall", "-Wextra", "-fPIC", "-shared", "-fvisibility=hidden")
 
 
-def export_fmu(path: Path, profile: str, command: str, fmi: Fmi) -> None:
+def export_fmu(path: Path, profile: str, orbit: str, command: str, fmi: Fmi) -> None:
     """Write the FMU with its binary and its source.
 
     Parameters
     ----------
-    profile, command
-        Start values of the parameters: the device profile, and the program that starts the emulator.
+    profile, orbit, command
+        Start values of the parameters: the device profile, its orbit, and the program that starts the emulator.
 
     Raises
     ------
     EmulatorError
         There is no C compiler, or it fails.
     """
-    model_variables = variables(profile, command)
+    model_variables = variables(profile, orbit, command)
     token = "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, repr((version("starhil"), fmi, model_variables)))) + "}"
     template = Template(
         _text("modelDescription.xml.j2"),

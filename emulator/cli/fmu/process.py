@@ -123,6 +123,8 @@ def _closed(stack: ExitStack, error: str) -> str:
 
 def _command(values: Values) -> list[str]:
     settings = [*LOCK_STEP, *(f"truth.{key}={values[key]}" for key in ("convention", "order"))]
+    if values["orbit"]:
+        settings.insert(0, f"orbit={values['orbit']}")
     if values["symlink"]:
         settings.append(f"links.serial.symlink={values['symlink']}")
     return emulator_command(

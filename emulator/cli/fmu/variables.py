@@ -39,13 +39,13 @@ class Variable:
         return TYPES[type(self.start)][fmi]
 
 
-def variables(profile: str = "", command: str = "") -> list[Variable]:
+def variables(profile: str = "", orbit: str = "", command: str = "") -> list[Variable]:
     """Return all variables, in the order of their value references: numbers and truth values, then texts.
 
     Parameters
     ----------
-    profile, command
-        Start values: the device profile, and the program that starts the emulator.
+    profile, orbit, command
+        Start values: the device profile, its orbit, and the program that starts the emulator.
     """
     attitude, rotation = (
         "Attitude quaternion of the body, see convention and order",
@@ -75,6 +75,7 @@ def variables(profile: str = "", command: str = "") -> list[Variable]:
         Variable("mode", "", "Mode in which it was taken", "output"),
         Variable("ready", "", "Ready line of the emulator, with its links", "output"),
         Variable("profile", profile, "Device profile: a name or the path of a TOML file", "parameter"),
+        Variable("orbit", orbit, "Orbit in place of the profile's: leo, or the path of a TOML file", "parameter"),
         Variable("serial", "auto", "Serial link: auto, a device path, listen://HOST:PORT or off", "parameter"),
         Variable("symlink", "", "Symbolic link to the pty of serial = auto", "parameter"),
         Variable("can", "off", "CAN link: auto, a channel or off", "parameter"),

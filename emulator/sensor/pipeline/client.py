@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol, TypeAlias
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, one_line
 from starhil.emulator.sensor.pipeline.messages import (
     LENGTH,
     Failure,
@@ -32,7 +32,7 @@ from starhil.emulator.sensor.pipeline.messages import (
     with_length,
 )
 from starhil.emulator.sensor.pipeline.worker_process import Worker
-from starhil.emulator.simulation.guard import call_guarded, one_line
+from starhil.emulator.simulation.guard import call_guarded
 from starhil.emulator.simulation.signal import Signal
 
 log = logging.getLogger("starhil.pipeline")

@@ -178,8 +178,8 @@ class IndexRequest:
 
     settings: SolverSettings
     upsets: tuple[CatalogUpset, ...] = ()
-    rehearsals: tuple[FrameRequest, ...] = ()
-    """Frames to take without a result, so that every kernel that they need is compiled before the first one that counts."""
+    rehearsal: FrameRequest | None = None
+    """Frame to take without a result, so that all that it needs is there before the first one that counts."""
 
 
 @dataclass(frozen=True)

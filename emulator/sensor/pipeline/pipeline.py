@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, one_line
 from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.pipeline.binning import mean_over_squares
@@ -44,9 +44,8 @@ from starhil.emulator.sensor.pipeline.precompile import start_helper
 from starhil.emulator.sensor.pipeline.preview import make_preview
 from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starhil.emulator.sensor.renderer import Frame, Renderer, frame_without_truth
-from starhil.emulator.sensor.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
+from starhil.emulator.sensor.sky.objects import SkyObjects
 from starhil.emulator.sensor.sky.view import Sky
-from starhil.emulator.simulation.guard import one_line
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.arrays import Array, Mask
 from starid.attitude import Attitude
@@ -82,13 +81,6 @@ _LONGEST_STILL_PX: Final = 1.0
 """Longest trail of a star that is taken for a spot."""
 
 _MAX_FALSE_PROBABILITY: Final = Effort().max_false_probability_tracking
-
-_WARM_UP_BODIES: Final = SkyObjects(
-    sun=SunGlare(0.0, 80.0),
-    moon=Moon(90.0, 80.0),
-    earth=EarthLimb(180.0, 20.0, sun_ra_deg=0.0, sun_dec_deg=0.0),
-)
-"""Bodies in and near the field of the identity attitude."""
 
 _WARM_UP_EXPOSURE_S: Final = 1.0
 """Exposure in which a dim sensor too sees enough stars to follow their trails, seconds."""
@@ -183,9 +175,6 @@ class Pipeline:
         for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):
             turning = TruthState(attitude, np.array(rate))
             self._process_frame(replace(request, truth=turning, predicted=predicted))
-        if self._sky.by_date:
-            for earth in (_WARM_UP_BODIES.earth, EarthLimb(180.0, 80.0, radius_deg=5.0)):
-                self._renderer.render(Attitude.identity(), objects=replace(_WARM_UP_BODIES, earth=earth))
         self._last = None
         gc.enable()
 
@@ -196,8 +185,8 @@ class Pipeline:
         try:
             if isinstance(request, IndexRequest):
                 self._identifiers.build(self._identifier_setup(request))
-                for rehearsal in request.rehearsals:
-                    self._rehearse(rehearsal)
+                if request.rehearsal is not None:
+                    self._rehearse(request.rehearsal)
                 return IndexReady()
             if isinstance(request, ImageRequest):
                 return self._scaled_image(request)
@@ -210,7 +199,7 @@ class Pipeline:
             return Failure(f"pipeline: internal error: {one_line(error)}")
 
     def _rehearse(self, request: FrameRequest) -> None:
-        """Take a frame that does not count: as it is, and with the bodies of its sky in the field.
+        """Take a frame that does not count.
 
         Only `geometric` keeps nothing from frame to frame, so that only it identifies stars in them.
         """
@@ -222,15 +211,6 @@ class Pipeline:
                 self._process_frame(replace(request, predicted=predicted))
         else:
             self.detections(request)
-        truth = request.truth
-        objects = self._sky.view(truth.unix_s, None, None, request.faults).objects
-        placed = {
-            name: getattr(_WARM_UP_BODIES, name)
-            for name in ("sun", "moon", "earth")
-            if getattr(objects, name)
-        }
-        if placed:
-            self._renderer.render(Attitude.identity(), objects=replace(objects, **placed))
         self._last = last
 
     def _process_frame(self, request: FrameRequest) -> FrameResult:
@@ -245,30 +225,30 @@ class Pipeline:
             return FrameResult(request.index, solved=False, render_s=rendered - begin, preview=preview)
         identifier, current = self._identifiers.get(self._identifier_setup(request))
         windows = self._detect_predicted(exposure, request, sensor)
-        found = self._detect(exposure, request, sensor) if windows is None else windows
+        detections = self._detect(exposure, request, sensor) if windows is None else windows
         detected = time.perf_counter()
-        solution = self._solve(identifier, found, request)
+        solution = self._solve(identifier, detections, request)
         if windows is not None and not solution.valid:
-            found = self._detect(exposure, request, sensor)
+            detections = self._detect(exposure, request, sensor)
             detected = time.perf_counter()
-            solution = self._solve(identifier, found, request)
+            solution = self._solve(identifier, detections, request)
         if not solution.valid or _less_certain(solution, request):
-            found, solution = self._follow(exposure, request, sensor, identifier, found, solution)
+            detections, solution = self._follow(exposure, request, sensor, identifier, detections, solution)
         solved = time.perf_counter()
         times = (begin, rendered, detected, solved)
-        result = self._frame_result(request, sensor, found, solution, identifier, times)
+        result = self._frame_result(request, sensor, detections, solution, identifier, times)
         if exposure.frame is not None:
             stars = exposure.frame.stars
-            seen = stars_seen(stars.xy_px[stars.visible], found.xy_px) if exposure.in_field else 0
+            seen = stars_seen(stars.xy_px[stars.visible], detections.xy_px) if exposure.in_field else 0
             enough = seen >= request.settings.min_stars_matched
             result = with_bodies(result, exposure.in_field, enough_stars=enough)
             if solution.features is not None:
-                false = exposure.false_stars(found.xy_px)
+                false = exposure.false_stars(detections.xy_px)
                 removed = list(solution.features.removed_index)
                 counts = int(np.count_nonzero(false)), int(np.count_nonzero(false[removed]))
                 result = replace(result, false_detected=counts[0], false_removed=counts[1])
         if request.preview:
-            result = replace(result, preview=self._preview(exposure, sensor, found, solution))
+            result = replace(result, preview=self._preview(exposure, sensor, detections, solution))
         return result if current else replace(result, index_pending=True)
 
     def detections(self, request: FrameRequest) -> tuple[Detections, Mask]:
@@ -282,9 +262,9 @@ class Pipeline:
         """Return the star identifier for the parameters of a request."""
         return self._identifiers.build(self._identifier_setup(request))
 
-    def solution(self, found: Detections, request: FrameRequest) -> Solution:
+    def solution(self, detections: Detections, request: FrameRequest) -> Solution:
         """Identify detections with the parameters of a request."""
-        return self._solve(self.identifier(request), found, request)
+        return self._solve(self.identifier(request), detections, request)
 
     def _detect(self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel) -> Detections:
         return detect(*self._detection(exposure, request, sensor))
@@ -303,12 +283,12 @@ class Pipeline:
         self,
         exposure: _Exposure,
         sensor: SensorModel,
-        found: Detections | None = None,
+        detections: Detections | None = None,
         solution: Solution | None = None,
     ) -> Preview:
         """Return the preview of an image; without truth if the image was not rendered."""
         frame = exposure.frame or frame_without_truth(exposure.image, exposure.index)
-        return make_preview(frame, self.camera, sensor, exposure.objects, found, solution)
+        return make_preview(frame, self.camera, sensor, exposure.objects, detections, solution)
 
     def _expose(self, request: FrameRequest) -> _Exposure:
         """Take the next image from its source, or render it."""
@@ -346,11 +326,11 @@ class Pipeline:
         temperature = self._sensor.temperature_c if request.temperature_c is None else request.temperature_c
         return self._dark.subtracted(image, request.exposure_s, request.gain, temperature)
 
-    def _solve(self, identifier: StarIdentifier, found: Detections, request: FrameRequest) -> Solution:
+    def _solve(self, identifier: StarIdentifier, detections: Detections, request: FrameRequest) -> Solution:
         settings = request.settings
-        chosen = slice(0, settings.max_stars_matched if self._setup.algorithm == "geometric" else None)
-        xy, flux = found.xy_px[chosen], found.flux[chosen] / request.exposure_s
-        errors = found.position_errors[chosen]
+        brightest = slice(0, settings.max_stars_matched if self._setup.algorithm == "geometric" else None)
+        xy, flux = detections.xy_px[brightest], detections.flux[brightest] / request.exposure_s
+        errors = detections.position_errors[brightest]
         if request.predicted is None:
             solution = identifier.identify(xy, flux, errors, observer_velocity=request.observer_velocity)
         else:
@@ -386,21 +366,21 @@ class Pipeline:
         request: FrameRequest,
         sensor: SensorModel,
         identifier: StarIdentifier,
-        found: Detections,
+        detections: Detections,
         failed: Solution,
     ) -> tuple[Detections, Solution]:
         """Look for few and faint stars where a prediction expects them; return detections and solution, or those given."""
         covariance, least = request.prediction_covariance, self._setup.tracking_stars
         predicted = self._window_centre(request)
         if covariance is None or least == 0 or predicted is None or self._leaves_trails(request):
-            return found, failed
+            return detections, failed
         settings, camera = request.settings, calibrated_camera(self.camera, request.settings)
         stars = self._tracked_stars(
             settings.limiting_magnitude + 2.5 * math.log10(settings.detection_threshold / _TRACKED_SIGMA)
         )
         places = self._predicted_places(predicted, request, stars)
         if len(places) < least:
-            return found, failed
+            return detections, failed
         image, known = self._detection(exposure, request, sensor)
         faint = replace(
             known,
@@ -415,7 +395,7 @@ class Pipeline:
             self._setup.tracking_error_rad, rivals=rivals, observer_velocity=request.observer_velocity, known=self._calibration,
         )  # fmt: skip
         if not solution.valid or solution.star_count < least:
-            return found, failed
+            return detections, failed
         rows = identifier.catalog.index_of(solution.hip).astype(np.int64)
         return seen, replace(solution, catalog_index=rows)
 
@@ -494,7 +474,7 @@ class Pipeline:
         self,
         request: FrameRequest,
         sensor: SensorModel,
-        found: Detections,
+        detections: Detections,
         solution: Solution,
         identifier: StarIdentifier,
         times: tuple[float, float, float, float],
@@ -503,16 +483,16 @@ class Pipeline:
         begin, rendered, detected, solved = times
         zero_e = sensor.zero_magnitude_e_s * sensor.exposure_s
         camera = _camera_of(solution, identifier)
-        measured = camera.back_project(found.xy_px[solution.detection_index])
+        measured = camera.back_project(detections.xy_px[solution.detection_index])
         modelled = identifier.catalog.vectors[solution.catalog_index]
         stars = sorted(
             (
                 MatchedStar(
                     hip=int(hip),
-                    x=float(found.xy_px[row, 0]),
-                    y=float(found.xy_px[row, 1]),
-                    magnitude=-2.5 * math.log10(max(float(found.flux[row]), 1.0) / zero_e),
-                    snr=float(found.flux[row] / found.flux_sigma[row]),
+                    x=float(detections.xy_px[row, 0]),
+                    y=float(detections.xy_px[row, 1]),
+                    magnitude=-2.5 * math.log10(max(float(detections.flux[row]), 1.0) / zero_e),
+                    snr=float(detections.flux[row] / detections.flux_sigma[row]),
                     vector=as_triple(direction),
                     icrs=as_triple(icrs),
                 )
@@ -524,7 +504,7 @@ class Pipeline:
         )
         valid = solution.valid
         x, y, z, w = solution.quaternion_xyzw.tolist() if valid else (0.0, 0.0, 0.0, 0.0)
-        reason = solution.reason.value if found.searchable else "detection_failed"
+        reason = solution.reason.value if detections.searchable else "detection_failed"
         rate = solution.rate_rad_s
         return FrameResult(
             index=request.index,
@@ -535,15 +515,15 @@ class Pipeline:
             sigma_cross_arcsec=solution.cross_boresight_sigma_arcsec if valid else 0.0,
             sigma_roll_arcsec=solution.roll_sigma_arcsec if valid else 0.0,
             rate_rad_s=None if rate is None else (float(rate[0]), float(rate[1]), float(rate[2])),
-            detected=len(found.flux),
-            refused=found.rejected,
+            detected=len(detections.flux),
+            refused=detections.rejected,
             matched=solution.star_count,
             stars=tuple(stars[:STARS_SENT]),
             probability_false=solution.probability_false if valid else 1.0,
             rms_px=solution.rms_px if valid and solution.star_count else 0.0,
             features=solution.features,
-            background_dn=float(found.background),
-            noise_dn=float(found.noise),
+            background_dn=float(detections.background),
+            noise_dn=float(detections.noise),
             render_s=rendered - begin,
             detect_s=detected - rendered,
             identify_s=solved - detected,

@@ -11,8 +11,8 @@ import sys
 from contextlib import suppress
 from typing import Any, Final
 
+from starhil.emulator.errors import one_line
 from starhil.emulator.sensor.pipeline.messages import LENGTH, Failure, with_length
-from starhil.emulator.simulation.guard import one_line
 from starhil.emulator.simulation.parent_death_signal import end_with_parent
 
 NICE: Final = 5

@@ -19,7 +19,7 @@ import numpy as np
 
 from starhil.emulator.sensor.sky.objects import CelestialBody, EarthLimb, Moon, PointSource, SunGlare
 from starid.arrays import Array
-from starid.catalog.aberration import SPEED_OF_LIGHT_M_S, aberrated, checked_beta
+from starid.catalog.aberration import SPEED_OF_LIGHT_M_S, aberrated
 from starid.catalog.earth import ASTRONOMICAL_UNIT_M, DAY_S, in_metres, terrestrial_time
 
 Vector = Array
@@ -67,11 +67,12 @@ class Observer:
     @cached_property
     def _motion(self) -> Vector:
         """Barycentric places (3, 3) of Earth, Sun and Moon, m, and then their velocities (3, 3), m/s, ICRS."""
-        from starhil.emulator.sensor.sky.apparent import motion_at
-
         slot, since_s = divmod(self.unix_s, SLOT_S)
-        motion: Vector = motion_at(_cubics_of(int(slot)), since_s / SLOT_S, SLOT_S)
-        return motion
+        share = since_s / SLOT_S
+        a, b, c, d = _cubics_of(int(slot)).reshape(4, 3, 3)
+        place = a + share * (b + share * (c + share * d))
+        velocity = (b + share * (2.0 * c + share * 3.0 * d)) / SLOT_S
+        return np.stack([place, velocity])
 
     @cached_property
     def sun(self) -> Vector:
@@ -99,39 +100,22 @@ class Observer:
         return velocity if self.relative_velocity_m_s is None else velocity + self.relative_velocity_m_s
 
     @cached_property
-    def _beta(self) -> Vector:
-        """Velocity (3,) as a fraction of the speed of light."""
-        return checked_beta(self.velocity_m_s)
-
-    @cached_property
-    def _bodies(self) -> Vector:
-        """Apparent right ascension, declination, degrees, and direction (9, 5) of Sun, Moon and the planets."""
-        from starhil.emulator.sensor.sky.apparent import apparent_bodies
-
-        slot, since_s = divmod(self.unix_s, SLOT_S)
-        places, velocities, _ = _planets_of(int(slot))
-        position, beta = self.position_m, self._beta
-        seen: Vector = apparent_bodies(self.sun, self.moon, places, velocities, since_s, position, beta)
-        return seen
-
-    @cached_property
     def directions(self) -> Vector:
         """Apparent directions (9, 3) of Sun, Moon and the planets."""
-        return self._bodies[:, 2:]
+        slot, since_s = divmod(self.unix_s, SLOT_S)
+        places, velocities, _ = _planets_of(int(slot))
+        gaps = np.vstack([self.sun, self.moon, places + since_s * velocities]) - self.position_m
+        return aberrated(gaps / np.sqrt(np.sum(gaps * gaps, axis=1, keepdims=True)), self.velocity_m_s)
 
     @cached_property
-    def places_deg(self) -> list[list[float]]:
+    def places_deg(self) -> list[tuple[float, float]]:
         """Apparent right ascension and declination of Sun, Moon and the planets, degrees."""
-        places: list[list[float]] = self._bodies[:, :2].tolist()
-        return places
+        return [_place_deg(direction) for direction in self.directions]
 
     def apparent_stars(self, vectors: Vector, parallax_rad: Vector) -> Vector:
         """Return the directions (n, 3) of stars with parallax and aberration, as vectors of length 1 but for the parallax."""
-        from starhil.emulator.sensor.sky.apparent import apparent_stars
-
-        position_au = self.position_m / ASTRONOMICAL_UNIT_M
-        seen: Vector = apparent_stars(vectors, parallax_rad, position_au, self._beta)
-        return seen
+        shift = parallax_rad[:, None] * (self.position_m / ASTRONOMICAL_UNIT_M)
+        return aberrated(vectors - shift, self.velocity_m_s)
 
 
 def sun_seen_by(observer: Observer, style: SunGlare, earth: EarthLimb | None) -> SunGlare | None:
@@ -177,10 +161,12 @@ def earth_seen_by(observer: Observer, style: EarthLimb) -> EarthLimb | None:
     if observer.relative_velocity_m_s is not None:
         nadir = aberrated(nadir, observer.relative_velocity_m_s)
     to_limb = math.sqrt(max(distance**2 - EARTH_RADIUS_M**2, EARTH_RADIUS_M * ATMOSPHERE_M))
+    ra_deg, dec_deg = _place_deg(nadir)
     sun_ra_deg, sun_dec_deg = observer.places_deg[0]
     return dataclasses.replace(
         style,
-        **_place(nadir),
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
         radius_deg=math.degrees(math.asin(min(EARTH_RADIUS_M / distance, 1.0))),
         atmosphere_deg=math.degrees(math.atan(ATMOSPHERE_M / to_limb)),
         sun_ra_deg=sun_ra_deg,
@@ -275,13 +261,10 @@ def hidden_by(earth: EarthLimb | None, body: CelestialBody) -> bool:
     return earth is not None and _angle(body.direction, earth.direction) < earth.radius_rad
 
 
-def _place(direction: Vector) -> dict[str, float]:
-    """Right ascension and declination of a direction, degrees, by the names of a body's fields."""
+def _place_deg(direction: Vector) -> tuple[float, float]:
+    """Right ascension and declination of a direction, degrees."""
     x, y, z = direction.tolist()
-    return {
-        "ra_deg": math.degrees(math.atan2(y, x)) % 360.0,
-        "dec_deg": math.degrees(math.atan2(z, math.hypot(x, y))),
-    }
+    return math.degrees(math.atan2(y, x)) % 360.0, math.degrees(math.atan2(z, math.hypot(x, y)))
 
 
 def _length(vector: Vector) -> float:

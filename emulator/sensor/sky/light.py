@@ -1,28 +1,21 @@
-"""Light and shadow over areas of an image: Sun, Moon, Earth and obstructions."""
+"""What Sun, Moon, Earth and obstructions put into an image: their stray light, discs, limb and shadows."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
 
-from starhil.emulator.sensor.sky.light_grid import GLARE_STEP, Backdrop, Image, Line, fill
-from starhil.emulator.sensor.sky.light_kernels import (
+from starhil.emulator.sensor.sky.area_light import (
+    AreaLight,
     Box,
     Glare,
-    NearGlare,
-    add_earth,
-    add_glare,
-    blurred,
-    cover_box,
-    draw_moon,
-    points_near,
-    refine_glare,
-    transmission_at,
+    Image,
+    Patch,
+    row_blocks,
+    scalar_products,
 )
 from starhil.emulator.sensor.sky.objects import (
     SUN_V,
@@ -33,8 +26,7 @@ from starhil.emulator.sensor.sky.objects import (
     SkyObjects,
     SunGlare,
 )
-from starhil.emulator.sensor.sky.wide_earth import GLOW_HEIGHTS, WideEarth
-from starid.arrays import Array, Indices
+from starid.arrays import Array, Array32
 from starid.attitude import Attitude
 from starid.camera import Camera
 
@@ -43,9 +35,6 @@ _GLARE_FROM_DEG: Final = 0.3
 _GLARE_TO_DEG: Final = 30.0
 _SUN_REFERENCE_DEG: Final = 30.0
 _SUN_SOFT_DEG: Final = 3.0
-
-_SMOOTH_PX: Final = 13.0 * GLARE_STEP
-"""Distance to a source, or softness of its glare, from which its light is smooth, pixels: interpolated within 0.5 %."""
 
 _EDGE_PX: Final = 8.0
 """Pixels around the Moon's disc into which its edge is blurred."""
@@ -56,94 +45,26 @@ _BLUR_SIGMAS: Final = 4.0
 _SPOT_SIGMAS: Final = 2.0
 """Width of a spot in units of its standard deviation."""
 
-_WIDE_EARTH_DEG: Final = 20.0
-"""Angular radius of the Earth from which it is computed on the grid: the limb is within 0.03 pixels of its place."""
+_GLOW_HEIGHTS: Final = 20.0
+"""Heights of the atmosphere above the limb up to which it glows."""
+
+_LIMB_STEPS: Final = 1024
+"""Steps of the table of the limb, in which light is interpolated."""
+
+_GRID_STEP: Final = 8
+"""Pixels between the points that are examined for the part of an image that shows a body."""
 
 
-@dataclass(frozen=True)
-class Patch:
-    """Light and shadow in part of an image."""
-
-    box: Box
-    light: Image
-    """Electrons/s in a pixel of mean sensitivity, (h', w'), float32."""
-    passed: Image
-    """Fraction of the light from behind that is visible, 0…1, (h', w'), float32."""
-    hides_glare: bool = True
-    """Whether it is in front of the light scattered in the lens too."""
-
-    def seen_at(self, xy_px: Array) -> Array:
-        """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
-        return transmission_at(self.passed, self.box, xy_px)
-
-    def cover(self, mean: Image, backdrop: Backdrop) -> None:
-        """Put it in front of the mean electrons (h, w), in place."""
-        light = backdrop.unit * backdrop.exposure_s, backdrop.sky_e_s
-        planes = mean, backdrop.still, backdrop.sensitivity
-        cover_box(planes, self.light, self.passed, self.box, light, self.hides_glare)
-
-
-@dataclass(frozen=True)
-class AreaLight:
-    """Light of extended objects, and the fraction of the sky's light that passes them."""
-
-    size: tuple[int, int]
-    glare: Image | None = None
-    """Smooth light in electrons/s in a pixel of mean sensitivity, at every `GLARE_STEP`-th column and row, (gh, gw)."""
-    near: tuple[NearGlare, ...] = ()
-    """What is not smooth of that light."""
-    earth: WideEarth | None = None
-    """An Earth in front of `glare`, sky and the patches before the last `in_front`."""
-    behind: tuple[Patch, ...] = ()
-    in_front: tuple[Patch, ...] = ()
-    """What lies behind and in front of that Earth."""
-    flooded: bool = False
-    """Light passes the baffle and saturates the image; the rest is then empty."""
-
-    def seen_at(self, xy_px: Array) -> Array:
-        """Return the transmission (n,) at positions (n, 2); outside the image that of its edge."""
-        transmission = np.full(len(xy_px), 0.0 if self.flooded else 1.0)
-        if self._layers:
-            nearest = np.clip(xy_px, 0.0, np.array(self.size) - 1.0)
-            for layer in self._layers:
-                transmission *= layer.seen_at(nearest)
-        return transmission
-
-    @property
-    def covered_share(self) -> float:
-        """Fraction of the image that receives less than half of the sky's light; behind obstructions, by a grid of pixels."""
-        if not self.in_front:
-            hidden = sum(np.count_nonzero(patch.passed < 0.5) for patch in self.behind)
-            share = float(self.flooded) if self.earth is None else self.earth.covered_share
-            return min(share + hidden / math.prod(self.size), 1.0)
-        x, y = np.meshgrid(*(np.arange(GLARE_STEP // 2, size, GLARE_STEP) for size in self.size))
-        return float(np.mean(self.seen_at(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)) < 0.5))
-
-    @property
-    def _layers(self) -> tuple[Patch | WideEarth, ...]:
-        return (*self.behind, *(() if self.earth is None else (self.earth,)), *self.in_front)
-
-    def draw(self, mean: Image, backdrop: Backdrop) -> None:
-        """Fill the mean electrons (h, w) with the backdrop, and all light and shadow.
-
-        What `mean` holds before must be finite: it stays behind a wide Earth until that is drawn.
-        """
-        glare = self.glare
-        if glare is not None and backdrop.exposure_s * np.max(glare) <= backdrop.min_glare_e:
-            glare = None
-        if glare is None and self.earth is None:
-            np.copyto(mean, backdrop.still)
-        else:
-            none = np.empty((0, 0), dtype=np.float32)
-            hidden = none if self.earth is None else self.earth.grid[2]
-            exposure_s = backdrop.unit * backdrop.exposure_s
-            smooth = none if glare is None else glare
-            planes = backdrop.still, backdrop.dark, backdrop.sensitivity
-            fill(mean, planes, smooth, hidden, (backdrop.dark_unit_e, backdrop.sky_e_s, exposure_s))
-        for near in self.near:
-            refine_glare(mean, backdrop.sensitivity, near, backdrop.unit * backdrop.exposure_s)
-        for layer in self._layers:
-            layer.cover(mean, backdrop)
+def _blurred(image: Image, taps: Array32) -> Image:
+    """Return an image convolved with weights (2 m + 1,) along both axes; beyond its edge it goes on as it is there."""
+    reach = taps.size // 2
+    for _ in range(2):
+        padded = np.pad(image, ((reach, reach), (0, 0)), mode="edge")
+        blurred = np.zeros_like(image)
+        for k, tap in enumerate(taps):
+            blurred += tap * padded[k : k + len(image)]
+        image = blurred.T
+    return image
 
 
 def disc_in_field(centre: Array, radius_rad: float, camera: Camera) -> bool:
@@ -195,6 +116,11 @@ def _is_lit(earth: EarthLimb, towards: Array, off_nadir_deg: float) -> bool:
     return float(normal @ sun) > 0.0
 
 
+def _chord(angle_rad: float) -> float:
+    """Chord of an angle on the unit circle."""
+    return 2.0 * math.sin(0.5 * angle_rad)
+
+
 def _off_axis_deg(attitude: Attitude, body: CelestialBody) -> float:
     """Angle of a body's centre from the boresight, degrees."""
     chord = math.dist(body.direction.tolist(), attitude.boresight.tolist())
@@ -216,16 +142,17 @@ class AreaPainter:
     @cached_property
     def _directions(self) -> Image:
         """Unit vectors (3, h, w) of the pixels, sensor frame; −z for pixels without a direction."""
-        return self._directions_of(np.arange(self._camera.width), np.arange(self._camera.height))
+        width, height = self._size
+        planes = np.empty((3, height, width), dtype=np.float32)
+        for rows in row_blocks(0, height, width):
+            y, x = np.mgrid[rows, :width]
+            vectors = self._camera.back_project(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
+            vectors[np.isnan(vectors).any(axis=1)] = (0.0, 0.0, -1.0)
+            planes[:, rows] = vectors.T.reshape(3, -1, width)
+        return planes
 
     @cached_property
-    def _grid_directions(self) -> Image:
-        """Unit vectors (3, gh, gw) of the points of the glare's grid."""
-        steps = (GLARE_STEP * np.arange(-(-size // GLARE_STEP) + 1) for size in self._size)
-        return self._directions_of(*steps)
-
-    @cached_property
-    def _spot_taps(self) -> Line:
+    def _spot_taps(self) -> Array32:
         """Weights (2 m + 1,) of a Gaussian as wide as a spot."""
         reach = math.ceil(_BLUR_SIGMAS * self._psf_sigma_px)
         weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / self._psf_sigma_px) ** 2)
@@ -235,12 +162,6 @@ class AreaPainter:
     def _size(self) -> tuple[int, int]:
         return self._camera.width, self._camera.height
 
-    def _directions_of(self, columns: Indices, rows: Indices) -> Image:
-        x, y = np.meshgrid(columns, rows)
-        vectors = self._camera.back_project(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
-        vectors[np.isnan(vectors).any(axis=1)] = (0.0, 0.0, -1.0)
-        return np.ascontiguousarray(vectors.T.reshape(3, rows.size, columns.size), dtype=np.float32)
-
     def paint(self, objects: SkyObjects, attitude: Attitude) -> AreaLight:
         """Return light and transmission of all extended objects at one attitude."""
         if not objects.blank and through_baffle(objects, attitude):
@@ -248,58 +169,35 @@ class AreaPainter:
         sun, earth = objects.sun, objects.earth
         disc = sun.disc if sun and self._in_field(sun, sun.radius_rad, attitude) else None
         lights = [body for body in (sun, disc, objects.moon) if body]
-        glare, near = self._glare(lights, attitude)
-        behind = tuple(
-            patch for body in lights if isinstance(body, Moon) for patch in self._disc_patch(body, attitude)
+        glare = tuple(
+            self._glare(body, attitude) for body in lights if _off_axis_deg(attitude, body) <= body.reach_deg
         )
-        wide_earth: WideEarth | None = None
-        in_front: list[Patch] = []
+        patches = [
+            patch for body in lights if isinstance(body, Moon) for patch in self._disc_patch(body, attitude)
+        ]
         if earth is not None and self._in_field(earth, self._reach_rad(earth), attitude):
-            if earth.radius_deg >= _WIDE_EARTH_DEG:
-                wide_earth = self._wide_earth(earth, attitude)
-            else:
-                in_front = self._small_earth(earth, attitude)
-        covers = [self._obstruction_transmission(obstruction) for obstruction in objects.obstructions]
+            patches += self._earth_patch(earth, attitude)
+        covers = [_transmission_of(obstruction, *self._size) for obstruction in objects.obstructions]
         if objects.blank:
             covers.append(np.zeros(self._size[::-1], dtype=np.float32))
         everything = (0, self._camera.height, 0, self._camera.width)
-        in_front += [Patch(everything, np.zeros_like(cover), cover) for cover in covers]
-        return AreaLight(self._size, glare, near, wide_earth, behind, tuple(in_front))
+        patches += [Patch(everything, np.zeros_like(cover), cover) for cover in covers]
+        return AreaLight(self._size, glare, self._directions if glare else None, tuple(patches))
 
     def _in_field(self, body: CelestialBody, radius_rad: float, attitude: Attitude) -> bool:
         """Whether any part of a disc around a body is in the field."""
         return disc_in_field(attitude.to_sensor(body.direction), radius_rad, self._camera)
 
-    def _glare(
-        self, lights: Sequence[SunGlare | Moon], attitude: Attitude
-    ) -> tuple[Image | None, tuple[NearGlare, ...]]:
-        """Return the glare of Sun and Moon on the grid, and near them."""
-        glare, near = None, []
-        grid, smooth_rad = self._grid_directions, _SMOOTH_PX * self._camera.pixel_scale_rad
-        for body in lights:
-            off_axis = _off_axis_deg(attitude, body)
-            if off_axis > body.reach_deg:
-                continue
-            strength, soft, cube = self._glare_of(body)
-            direction = attitude.to_sensor(body.direction)
-            source: Glare = (direction.astype(np.float32), strength, soft * soft, cube)
-            light = np.zeros(grid.shape[1:], dtype=np.float32)
-            add_glare(light, grid, source)
-            outside = math.radians(off_axis) - self._camera.field_radius_rad
-            if max(soft, outside) < smooth_rad:
-                box = self._box_around(direction, smooth_rad)
-                if box is not None:
-                    near.append((box, source, light, self._directions))
-            glare = light if glare is None else glare + light
-        return glare, tuple(near)
-
-    def _glare_of(self, body: SunGlare | Moon) -> tuple[float, float, bool]:
-        """Strength and softness of a body's stray light, and whether it falls with the cube of the angle."""
+    def _glare(self, body: SunGlare | Moon, attitude: Attitude) -> Glare:
+        """Return the stray light of a body."""
+        direction = attitude.to_sensor(body.direction)
+        outside = math.radians(_off_axis_deg(attitude, body)) - self._camera.field_radius_rad
+        nearest = _chord(max(outside, 0.0))
         if isinstance(body, SunGlare):
-            reference = 2.0 * math.sin(math.radians(_SUN_REFERENCE_DEG) / 2.0)
-            soft = 2.0 * math.sin(math.radians(_SUN_SOFT_DEG) / 2.0)
-            return body.stray_share * self._scattered(body.disc) * reference, soft, True
-        return self._scattered(body), math.radians(_GLARE_FROM_DEG), False
+            reference = _chord(math.radians(_SUN_REFERENCE_DEG))
+            strength = body.stray_share * self._scattered(body.disc) * reference
+            return Glare(direction, strength, _chord(math.radians(_SUN_SOFT_DEG)), nearest, cube=True)
+        return Glare(direction, self._scattered(body), math.radians(_GLARE_FROM_DEG), nearest, cube=False)
 
     def _scattered(self, body: Moon) -> float:
         """Electrons/s per pixel that the lens scatters at an angle, times its square as chord.
@@ -311,73 +209,114 @@ class AreaPainter:
         return self._electrons_s(body.magnitude) * share * self._camera.pixel_scale_rad**2
 
     def _electrons_s(self, magnitude: float) -> float:
-        """Electrons/s from all of a body."""
         return self._zero_magnitude_e_s * math.pow(10.0, -0.4 * magnitude)
 
     def _earthlight(self, earth: EarthLimb) -> float:
         """Electrons/s per pixel of an Earth with the Sun in the zenith, by Lambert's law."""
         return self._electrons_s(SUN_V) * earth.albedo / math.pi * self._camera.pixel_scale_rad**2
 
-    def _disc_patch(self, moon: Moon, attitude: Attitude) -> tuple[Patch, ...]:
+    def _disc_patch(self, moon: Moon, attitude: Attitude) -> list[Patch]:
         """Return the disc of Moon or Sun with the terminator; nothing if it is outside the image."""
         source, scale = attitude.to_sensor(moon.direction), moon.radius_rad / self._camera.pixel_scale_rad
         box = self._box_around(source, moon.radius_rad + _EDGE_PX * self._camera.pixel_scale_rad)
         if box is None:
-            return ()
+            return []
         x, y, z = moon.direction.tolist()
         across, along = math.hypot(x, y), math.radians(moon.bright_limb_deg)
         east, north = (-y / across, x / across, 0.0), (-x * z / across, -y * z / across, across)
         turn = (math.cos(along) / moon.radius_rad, math.sin(along) / moon.radius_rad)
         axes = attitude.to_sensor(np.array([north, east]))
+        top, bottom, left, right = box
+        directions = self._directions[:, top:bottom, left:right].astype(np.float64)
+        up, sideways, ahead = (
+            v[0] * directions[0] + v[1] * directions[1] + v[2] * directions[2] for v in (*axes, source)
+        )
+        u, v = turn[0] * up + turn[1] * sideways, turn[0] * sideways - turn[1] * up
+        inside = np.clip(0.5 + (1.0 - np.sqrt(u * u + v * v)) * scale, 0.0, 1.0) * (ahead > 0.0)
+        terminator = (1.0 - 2.0 * moon.illuminated) * np.sqrt(np.maximum(1.0 - v * v, 0.0))
         area = max(math.pi * scale**2 * moon.illuminated, 1.0)
-        shape = (scale, moon.illuminated, self._electrons_s(moon.magnitude) / area)
-        disc, passed = np.empty((2, box[1] - box[0], box[3] - box[2]), dtype=np.float32)
-        draw_moon(disc, passed, self._directions, box, (axes, turn, source), shape)
-        return (Patch(box, blurred(disc, self._spot_taps), passed, hides_glare=False),)
+        brightness = self._electrons_s(moon.magnitude) / area
+        disc = inside * np.clip(0.5 + (u - terminator) * scale, 0.0, 1.0) * brightness
+        light = _blurred(disc.astype(np.float32), self._spot_taps)
+        return [Patch(box, light, (1.0 - inside).astype(np.float32), hides_glare=False)]
 
     def _box_around(self, direction: Array, radius_rad: float) -> Box | None:
         """Return the part of the image that holds a disc in the sensor frame; None if it is outside."""
-        reach_rad = radius_rad + 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
+        reach_rad = radius_rad + 1.25 * _GRID_STEP * self._camera.pixel_scale_rad
         if math.acos(max(min(float(direction[2]), 1.0), -1.0)) > self._camera.field_radius_rad + reach_rad:
             return None
-        cosine = math.cos(min(reach_rad, math.pi))
-        top, bottom, left, right = points_near(self._grid_directions, direction.astype(np.float32), cosine)
-        width, height = self._size
-        top, bottom = GLARE_STEP * top, min(GLARE_STEP * bottom + 1, height)
-        left, right = GLARE_STEP * left, min(GLARE_STEP * right + 1, width)
-        return (top, bottom, left, right) if top < bottom and left < right else None
+        grid = self._directions[:, ::_GRID_STEP, ::_GRID_STEP]
+        near = scalar_products(grid, direction) >= math.cos(min(reach_rad, math.pi))
+        if not near.any():
+            return None
+        sides = []
+        for axis, size in ((1, self._camera.height), (0, self._camera.width)):
+            numbers = _GRID_STEP * np.flatnonzero(near.any(axis=axis))
+            sides += [int(numbers[0]), min(int(numbers[-1]) + _GRID_STEP, size)]
+        return sides[0], sides[1], sides[2], sides[3]
 
-    def _small_earth(self, earth: EarthLimb, attitude: Attitude) -> list[Patch]:
-        """Return the Earth's disc, pixel by pixel; nothing if it is outside the image."""
-        nadir, sun = self._earth_and_sun(earth, attitude)
+    def _earth_patch(self, earth: EarthLimb, attitude: Attitude) -> list[Patch]:
+        """Return the Earth's disc and its glow; nothing if it is outside the image.
+
+        The disc is as bright as the cosine of the Sun's zenith distance where the line of sight meets a sphere.
+        """
+        nadir = attitude.to_sensor(earth.direction)
         box = self._box_around(nadir, self._reach_rad(earth))
         if box is None:
             return []
-        directions = np.ascontiguousarray(self._directions[:, box[0] : box[1], box[2] : box[3]])
-        light, passed = np.zeros_like(directions[0]), np.ones_like(directions[0])
-        angles = (earth.radius_rad, self._atmosphere_rad(earth))
-        add_earth(light, passed, directions, nadir, sun, angles, self._earthlight(earth))
+        top, bottom, left, right = box
+        light = np.zeros((bottom - top, right - left), dtype=np.float32)
+        passed = np.ones_like(light)
+        zero, one = np.float32(0.0), np.float32(1.0)
+        distance = np.float32(1.0 / math.sin(earth.radius_rad))
+        sun = None if earth.sun_direction is None else attitude.to_sensor(earth.sun_direction)
+        behind = one if sun is None else np.float32(-float(distance) * sum(nadir * sun))
+        full = np.float32(self._earthlight(earth))
+        end, edge, step, limb_of = self._limb(earth)
+        for rows in row_blocks(0, bottom - top, right - left):
+            directions = self._directions[:, top + rows.start : top + rows.stop, left:right]
+            cosine = scalar_products(directions, nadir)
+            if not (cosine >= end).any():
+                continue
+            shade = np.full_like(cosine, behind)
+            if sun is not None:
+                depth = cosine * cosine
+                depth -= one
+                depth *= distance * distance
+                depth += one
+                along = distance * cosine
+                along -= np.sqrt(np.maximum(depth, zero, out=depth))
+                along *= scalar_products(directions, sun)
+                shade += along
+                np.clip(shade, zero, one, out=shade)
+            shade *= full
+            inside = cosine >= edge
+            light[rows] = np.where(inside, shade, zero)
+            passed[rows] = ~inside
+            limb = np.flatnonzero((cosine >= end) & ~inside)
+            place = (cosine.ravel()[limb] - end) / step
+            node = place.astype(np.int64)
+            place -= node
+            lower, upper = limb_of[:, node], limb_of[:, node + 1]
+            share, glow = lower + place * (upper - lower)
+            passed[rows].reshape(-1)[limb] = share
+            light[rows].reshape(-1)[limb] = shade.ravel()[limb] * glow
         return [Patch(box, light, passed)]
 
-    def _wide_earth(self, earth: EarthLimb, attitude: Attitude) -> WideEarth:
-        nadir, sun = self._earth_and_sun(earth, attitude)
-        directions = self._grid_directions
-        grid = np.empty_like(directions)
-        towards = np.array([nadir, sun], dtype=np.float32)
-        np.matmul(towards, directions.reshape(3, -1), out=grid[:2].reshape(2, -1))
-        np.arccos(np.clip(grid[0], -1.0, 1.0, out=grid[2]), out=grid[2])
-        grid[2] -= np.float32(earth.radius_rad)
-        grid[2] *= np.float32(1.0 / self._atmosphere_rad(earth))
-        distance = 1.0 / math.sin(earth.radius_rad)
-        behind = -distance * float(nadir @ sun) if np.any(sun) else 1.0
-        step_rad = GLARE_STEP * self._camera.pixel_scale_rad
-        return WideEarth(grid, distance, behind, self._earthlight(earth), step_rad)
+    def _limb(self, earth: EarthLimb) -> tuple[np.float32, np.float32, np.float32, Image]:
+        """Return a table (2, n) of the limb by the cosine of the angle from the Earth's centre.
 
-    def _earth_and_sun(self, earth: EarthLimb, attitude: Attitude) -> tuple[Array, Array]:
-        """Return the directions (3,) of the Earth's centre and of its Sun, sensor frame; zeros light all of the disc."""
-        sun = earth.sun_direction
-        nadir = attitude.to_sensor(earth.direction)
-        return nadir, np.zeros(3) if sun is None else attitude.to_sensor(sun)
+        It has the share of light that passes, and the brightness relative to the disc's, at equal steps of the cosine from the end of the
+        glow to the edge of the disc, which come first, with the step.
+        """
+        height_rad = self._atmosphere_rad(earth)
+        end = math.cos(min(earth.radius_rad + _GLOW_HEIGHTS * height_rad, math.pi))
+        step = (math.cos(earth.radius_rad) - end) / _LIMB_STEPS
+        angles = [math.acos(end + k * step) for k in range(_LIMB_STEPS)]
+        heights = [*((angle - earth.radius_rad) / height_rad for angle in angles), 0.0, 0.0]
+        table = [[min(height, 1.0) for height in heights], [math.exp(-height) for height in heights]]
+        edge = np.float32(end + _LIMB_STEPS * step)
+        return np.float32(end), edge, np.float32(step), np.array(table, dtype=np.float32)
 
     def _atmosphere_rad(self, earth: EarthLimb) -> float:
         """Return the angle over which the limb fades: the atmosphere's, but at least the width of a spot."""
@@ -386,27 +325,28 @@ class AreaPainter:
 
     def _reach_rad(self, earth: EarthLimb) -> float:
         """Return the angle from the Earth's centre to which the glow of its limb reaches."""
-        return earth.radius_rad + GLOW_HEIGHTS * self._atmosphere_rad(earth)
+        return earth.radius_rad + _GLOW_HEIGHTS * self._atmosphere_rad(earth)
 
-    def _obstruction_transmission(self, obstruction: Obstruction) -> Image:
-        """Return the transmission (h, w) of an obstruction."""
-        import cv2
 
-        height, width = self._camera.height, self._camera.width
-        if obstruction.polygon_px:
-            cover = np.ones((height, width), dtype=np.float32)
-            corners = np.round(np.array(obstruction.polygon_px) * 16.0).astype(np.int32)
-            cv2.fillPoly(cover, [corners], 0.0, cv2.LINE_8, 4)
-        else:
-            angle = math.radians(obstruction.angle_deg)
-            x, y = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
-            along = (math.cos(angle) * x)[None, :] + (math.sin(angle) * y)[:, None]
-            edge = np.quantile(along, 1.0 - obstruction.share)
-            partial = 0.0 < obstruction.share < 1.0
-            cover = (along <= edge if partial else np.full_like(along, obstruction.share == 0.0)).astype(
-                np.float32
-            )
-        if obstruction.softness_px <= 0.0:
-            return cover
-        soft = cv2.GaussianBlur(cover, (0, 0), obstruction.softness_px, borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(soft, dtype=np.float32)
+@lru_cache(maxsize=4)
+def _transmission_of(obstruction: Obstruction, width: int, height: int) -> Image:
+    """Return the transmission (h, w) of an obstruction."""
+    import cv2
+
+    if obstruction.polygon_px:
+        cover = np.ones((height, width), dtype=np.float32)
+        corners = np.round(np.array(obstruction.polygon_px) * 16.0).astype(np.int32)
+        cv2.fillPoly(cover, [corners], 0.0, cv2.LINE_8, 4)
+    else:
+        angle = math.radians(obstruction.angle_deg)
+        x, y = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
+        along = (math.cos(angle) * x)[None, :] + (math.sin(angle) * y)[:, None]
+        edge = np.quantile(along, 1.0 - obstruction.share)
+        partial = 0.0 < obstruction.share < 1.0
+        cover = (along <= edge if partial else np.full_like(along, obstruction.share == 0.0)).astype(
+            np.float32
+        )
+    if obstruction.softness_px <= 0.0:
+        return cover
+    soft = cv2.GaussianBlur(cover, (0, 0), obstruction.softness_px, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(soft, dtype=np.float32)

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Self
 from pydantic import BaseModel, Field, model_validator
 
 from starhil.emulator.sensor.sky.objects import BODY_KINDS, SkyObjects
-from starhil.emulator.sensor.sky.view import COMPUTED, PLACE, BodySource
+from starhil.emulator.sensor.sky.view import DATE_FIELDS, PLACE, BodySource
 from starhil.emulator.simulation.config_model import Date, Strict, model_of
 
 
@@ -27,13 +27,13 @@ class _SkyKeys(_ObjectKeys):
 
     @model_validator(mode="after")
     def _nothing_computed_is_given(self) -> Self:
-        for name, fields in COMPUTED.items() if self.bodies == "ephemeris" else ():
+        for name, fields in DATE_FIELDS.items() if self.bodies == "ephemeris" else ():
             body = getattr(self, name)
-            given = (
+            keys = (
                 () if body is None or not body.model_fields_set.isdisjoint(PLACE) else body.model_fields_set
             )
             for field in fields:
-                if field in given:
+                if field in keys:
                     raise ValueError(
                         f"{name}.{field} follows from the date; leave it out, or give ra_deg and dec_deg"
                     )

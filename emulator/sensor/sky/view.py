@@ -32,7 +32,7 @@ _STYLES: Final[dict[str, Any]] = {
 }
 """Defaults of the bodies that the date places."""
 
-COMPUTED: Final = {
+DATE_FIELDS: Final = {
     "sun": (),
     "moon": ("diameter_deg", "magnitude", "illuminated", "bright_limb_deg"),
     "earth": ("radius_deg", "atmosphere_deg", "sun_ra_deg", "sun_dec_deg"),

@@ -58,7 +58,7 @@ _TRIANGLES_PER_QUOTA2: Final = 6.0
 """(Triangles per pattern star) / (quota² · (longest side / width)⁴); measured on indices."""
 
 
-_MERGED: Final = ("vectors", "ra_rad", "dec_rad", "hp", "v")
+_MERGED_COLUMNS: Final = ("vectors", "ra_rad", "dec_rad", "hp", "v")
 """Columns of the catalogue that differ for merged stars."""
 
 
@@ -138,13 +138,13 @@ def obtain_stars(catalog: StarCatalog, settings: IndexSettings, cache: bool | st
 
     def build() -> Tables:
         stars = resolved_stars(catalog, settings.limiting_magnitude, settings.blend_rad)
-        return {name: getattr(stars, name) for name in ("hip", *_MERGED)}
+        return {name: getattr(stars, name) for name in ("hip", *_MERGED_COLUMNS)}
 
     text = repr((INDEX_VERSION, catalog.identity, settings.limiting_magnitude, settings.blend_rad))
     key = hashlib.sha256(text.encode()).hexdigest()[:16]
     stars = cached_tables(f"stars-{key}", build) if cache is True else build()
     rows = catalog.index_of(stars["hip"])
-    merged: dict[str, Any] = {name: stars[name] for name in _MERGED}
+    merged: dict[str, Any] = {name: stars[name] for name in _MERGED_COLUMNS}
     return dataclasses.replace(catalog.subset(rows), **merged)
 
 

@@ -54,7 +54,7 @@ from starid.kernels.small_arrays import zero
 SYSTEMATIC: Final = 14
 """Number of detections, brightest first, whose triangles are all tried first."""
 
-DRAWN_FROM: Final = 200
+TRIANGLE_STARS: Final = 200
 """Number of detections, brightest first, from which random triangles are drawn."""
 
 STRICT_TOLERANCE: Final = 0.5
@@ -284,7 +284,7 @@ def identify_kernel(
     while n >= min_matched:
         if stage == 1:
             draws += 1
-            state, a, b, c = _draw_three(state, min(n, DRAWN_FROM))
+            state, a, b, c = _draw_three(state, min(n, TRIANGLE_STARS))
             over = triangles >= limit or draws > 4 * limit
         else:
             i, j, k = _next_triangle(i, j, k)

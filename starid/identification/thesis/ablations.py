@@ -18,7 +18,7 @@ from starid.identification.thesis.features import FeatureVector
 from starid.identification.thesis.lsi import BORESIGHT, DEC, POINTER, RA, LostInSpace, LsiSolution
 from starid.identification.thesis.rsi_identifier import Preprocessed, RsiIdentifier
 
-Part = Literal["features", "weights", "motion", "region"]
+Part = Literal["features", "weights", "filter", "motion", "region"]
 
 ELSEWHERE_DEG: Final = (266.0, -29.0)
 """Right ascension and declination of the field whose features every image gets: the centre of the Galaxy."""
@@ -32,9 +32,10 @@ def without(part: Part | None) -> Iterator[None]:
 
     Parameters
     ----------
-    part : {"features", "weights", "motion", "region"}, optional
+    part : {"features", "weights", "filter", "motion", "region"}, optional
         Replaced are: the features of every image by those of another field; the weights of the LASSO by the same in random
-        order; the motion by its inverse; the nearest cell of the region of search by nothing. None takes nothing away.
+        order; the filter's choice by all detections; the motion by its inverse; the nearest cell of the region of search by
+        nothing. None takes nothing away.
     """
     with contextlib.ExitStack() as stack:
         for owner, name, replacement in _REPLACED[part] if part else ():
@@ -99,6 +100,11 @@ def _unit(vectors: Array) -> Array:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1)[:, None], dtype=np.float64)
 
 
+def _nothing_removed(identifier: RsiIdentifier, xy: Array, flux: Array) -> Preprocessed:
+    known = _preprocess(identifier, xy, flux)
+    return dataclasses.replace(known, true_stars=np.ones(flux.size, dtype=np.bool_))
+
+
 def _reversed_motion(identifier: RsiIdentifier, xy: Array, flux: Array) -> Preprocessed:
     known = _preprocess(identifier, xy, flux)
     return known if known.rotation is None else dataclasses.replace(known, rotation=known.rotation.T)
@@ -114,6 +120,7 @@ _REPLACED: Final[dict[Part, list[tuple[type, str, Callable[..., Any]]]]] = {
         (FeatureSearch, "doubtful_features", _doubtful_elsewhere),
     ],
     "weights": [(FeatureSearch, "answer_of", _shuffled_answer)],
+    "filter": [(RsiIdentifier, "preprocess", _nothing_removed)],
     "motion": [(RsiIdentifier, "preprocess", _reversed_motion)],
     "region": [(LostInSpace, "nearest_in_region", _nothing_found)],
 }

@@ -276,7 +276,7 @@ def exact_vector(arrays: CellArrays, cell: int, sums: Array, out: Array) -> floa
 
 
 @compiled
-def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, found: Array) -> int:
+def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, outcome: Array) -> int:
     """Find the cell whose full-precision features are nearest to the observation; −1 in an empty database.
 
     Parameters
@@ -285,7 +285,7 @@ def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, foun
         Index and arrays of the same database.
     observation
         Normalised observation, (5,).
-    found
+    outcome
         Output (2,): the distance on the normalised scale, and the number of cells computed from the stars.
     """
     query = observation * 2.55
@@ -293,8 +293,8 @@ def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, foun
     cells = np.empty(1, dtype=np.int64)
     stored_neighbours(index, query, distances, cells)
     best_cell = int(cells[0])
-    found[0] = math.inf
-    found[1] = 0.0
+    outcome[0] = math.inf
+    outcome[1] = 0.0
     if best_cell < 0:
         return -1
     sums = np.empty(8)
@@ -327,8 +327,8 @@ def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, foun
                 if exact < best or (exact == best and index.cells[i] < best_cell):
                     best = exact
                     best_cell = int(index.cells[i])
-    found[0] = math.sqrt(best) / 2.55
-    found[1] = computed
+    outcome[0] = math.sqrt(best) / 2.55
+    outcome[1] = computed
     return best_cell
 
 

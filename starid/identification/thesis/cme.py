@@ -28,7 +28,7 @@ _EM_ROUNDS: Final = 3
 _SEED: Final = 20_221_017
 _OUTLIER_SPAN_DEG: Final = 42.0
 _AFFINE_SAMPLE: Final = 3
-_IN_A_LINE: Final = 1e-12
+_COLLINEARITY: Final = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ def affine_fit(before: Array, now: Array, sample: Mask, matrix: Array) -> bool:
             xv += x * v
             yv += y * v
     determinant = xx * yy - xy * xy
-    if determinant <= _IN_A_LINE * (xx + yy) ** 2:
+    if determinant <= _COLLINEARITY * (xx + yy) ** 2:
         return False
     matrix[0, 0] = (xu * yy - yu * xy) / determinant
     matrix[0, 1] = (yu * xx - xu * xy) / determinant

@@ -29,7 +29,7 @@ MIN_STARS: Final = 3
 """Fewest stars of a field that has features."""
 
 # The search beyond the nearest cell is this project's, and so are its constants.
-_DOUBTFUL: Final = (0, -1, 1, -2, 2, -3, 3)
+_COUNT_CHANGES: Final = (0, -1, 1, -2, 2, -3, 3)
 """How many stars nearest the brightness limit may be on its wrong side, because of the errors of their magnitudes."""
 _MAGNITUDE_GATE: Final = 0.5
 """Largest difference between a detection and the catalogue star for which it votes, mag."""
@@ -164,7 +164,7 @@ class FeatureSearch:
     def doubtful_features(self, field: FieldStars) -> list[FeatureVector]:
         """Feature vectors with some stars fewer or more, those nearest the brightness limit; the likeliest first."""
         count = self.bright(field)
-        counts = [count + change for change in _DOUBTFUL]
+        counts = [count + change for change in _COUNT_CHANGES]
         return [
             extract_features(field.magnitude[:n], field.place[:n])
             for n in counts

@@ -15,7 +15,7 @@ MAX_VOTERS: Final = 48
 
 _MAX_COUPLES: Final = 40_000
 _MAX_HYPOTHESES: Final = 300
-_ENOUGH: Final = 0.45
+_MATCH_SHARE: Final = 0.45
 _GATE: Final = 4.5
 _MIN_PAIR: Final = 15.0
 
@@ -196,7 +196,7 @@ def find_motion(
     )
     trial = np.empty(4)
     stride = max(couple_count / _MAX_HYPOTHESES, 1.0)
-    enough = _ENOUGH * min(before.shape[0], now.shape[0])
+    enough = _MATCH_SHARE * min(before.shape[0], now.shape[0])
     for h in range(min(couple_count, _MAX_HYPOTHESES)):
         couple = couples[int(h * stride)]
         a, b = first[2][couple[0], 0], first[2][couple[0], 1]

@@ -133,11 +133,11 @@ def cell_sums(sky: SkyArrays, ra_deg: float, dec_deg: float, sums: Array) -> Non
 
 @inner_checked
 def stars_near(
-    sky: SkyArrays, ra_deg: float, dec_deg: float, margin: float, found: Array, rows: Indices
+    sky: SkyArrays, ra_deg: float, dec_deg: float, margin: float, spots: Array, rows: Indices
 ) -> int:
     """List the stars of a circular frame with north up, and a margin around it; return their number.
 
-    `found` (n, 3) receives x, y in the unit of the frame and the magnitude, `rows` (n,) their rows.
+    `spots` (n, 3) receives x, y in the unit of the frame and the magnitude, `rows` (n,) their rows.
     """
     stars, bin_start, frame = sky
     spherical = frame[SPHERICAL] > 0.5
@@ -156,10 +156,10 @@ def stars_near(
                     x, y = gnomonic(stars[i, UX], stars[i, UY], stars[i, UZ], turn, frame[FOCAL])
                 else:
                     x, y = flat_offset(stars[i, RIGHT_ASCENSION], stars[i, DECLINATION], ra_deg, dec_deg)
-                if x * x + y * y <= limit and count < found.shape[0]:
-                    found[count, 0] = x
-                    found[count, 1] = y
-                    found[count, 2] = stars[i, BRIGHTNESS]
+                if x * x + y * y <= limit and count < spots.shape[0]:
+                    spots[count, 0] = x
+                    spots[count, 1] = y
+                    spots[count, 2] = stars[i, BRIGHTNESS]
                     rows[count] = i
                     count += 1
     return count

@@ -265,7 +265,7 @@ def estimate_from_path(
     observation: Array,
     lambdas: Array,
     path: Array,
-    chosen: tuple[int, int],
+    steps: tuple[int, int],
     work: LsiWork,
 ) -> None:
     """Compute the estimates from the weights at two λ of a LASSO path.
@@ -277,7 +277,7 @@ def estimate_from_path(
     for row in range(2):
         omega = work.weights[row]
         result = work.results[row]
-        omega[:] = path[chosen[row]]
+        omega[:] = path[steps[row]]
         total = omega.sum()
         if total < _MIN_WEIGHT:
             for j in range(9):
@@ -291,7 +291,7 @@ def estimate_from_path(
             square += residual * residual
         result[0] = total
         result[4] = math.sqrt(square)
-        result[5] = lambdas[chosen[row]]
+        result[5] = lambdas[steps[row]]
         if searched.arrays.sky.frame[0] > 0.5:
             _sphere_estimate(omega, work, result)
         else:
@@ -348,7 +348,7 @@ def region_nearest(
     dec_deg: float,
     side_deg: float,
     theta: float,
-    found: Array,
+    outcome: Array,
 ) -> int:
     """Find the nearest neighbour among the cells of a square search region; −1 if the region has no cell.
 
@@ -360,7 +360,7 @@ def region_nearest(
         Centre and side Γ of the square, degrees; wraps in right ascension, clipped to the grid.
     theta
         Polar angle of the frame object, radians, as a sixth feature (full turn: 100); NaN to ignore it.
-    found
+    outcome
         Output (2,): distance on the normalised scale, and number of cells in the region.
     """
     arrays, grid = searched.arrays, searched.arrays.grid
@@ -410,8 +410,8 @@ def region_nearest(
             if d < best:
                 best = d
                 best_cell = cell
-    found[0] = math.sqrt(best) / 2.55
-    found[1] = count
+    outcome[0] = math.sqrt(best) / 2.55
+    outcome[1] = count
     return best_cell
 
 
@@ -479,14 +479,14 @@ class LostInSpace:
         A polar angle counts as a sixth feature, with 100 for a full turn; the answer then depends on roll.
         """
         self._check(observation)
-        found = np.empty(2)
+        outcome = np.empty(2)
         if not math.isnan(theta_rad):
-            cell = region_nearest(self.searched, observation, 0.0, 0.0, _WHOLE_SKY_DEG, theta_rad, found)
-            return cell, float(found[0])
+            cell = region_nearest(self.searched, observation, 0.0, 0.0, _WHOLE_SKY_DEG, theta_rad, outcome)
+            return cell, float(outcome[0])
         if self.searched.exact and self._reference is not None:
             return self._reference.exact_nearest(observation)
         if self.searched.exact:
-            return exact_nearest(self.index, self.arrays, observation, found), float(found[0])
+            return exact_nearest(self.index, self.arrays, observation, outcome), float(outcome[0])
         distances, cells = self.neighbours(observation, 1)
         return int(cells[0]), float(distances[0])
 

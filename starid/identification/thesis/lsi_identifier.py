@@ -130,13 +130,15 @@ class LsiIdentifier(VerifiedIdentifier):
         deep = max(self._limit_for(STARS_PER_MATCH, share), parameters.kappa)
         if options.detected_limit is not None:
             deep = min(deep, max(options.detected_limit + _DEEPER_MAG, parameters.kappa))
-        seen = self._seen_stars(deep + 1.0)
+        sensor_stars = self._sensor_stars(deep + 1.0)
         self.database = (
-            obtain_database(seen, parameters, cache=options.cache)
+            obtain_database(sensor_stars, parameters, cache=options.cache)
             if options.database is None
-            else given_database(Path(options.database), parameters, (self._catalog.identity, seen.identity))
+            else given_database(
+                Path(options.database), parameters, (self._catalog.identity, sensor_stars.identity)
+            )
         )
-        stars = sky_of(seen, dataclasses.replace(parameters, kappa=deep))
+        stars = sky_of(sensor_stars, dataclasses.replace(parameters, kappa=deep))
         self.search = FeatureSearch(
             camera,
             LostInSpace(self.database, solver=options.solver),
@@ -144,7 +146,7 @@ class LsiIdentifier(VerifiedIdentifier):
             np.identity(3),
             stars,
         )
-        self._circles = self._divided(seen, deep) if options.divided else []
+        self._circles = self._divided(sensor_stars, deep) if options.divided else []
         self._given_zero_point = options.zero_point
         self._zero_point = options.zero_point
         self._star_magnitude = self._magnitude_of_rank(share)
@@ -165,14 +167,14 @@ class LsiIdentifier(VerifiedIdentifier):
         )
         return FeatureErrors.of_search(self.search, photometry, REGION_DEG)
 
-    def _seen_stars(self, limit: float) -> StarCatalog:
+    def _sensor_stars(self, limit: float) -> StarCatalog:
         """Stars to a magnitude as the sensor sees them: unresolved ones merged, with its own magnitudes as `v`."""
         resolved = resolved_stars(self._catalog, limit, _BLEND_PX / self._camera.focal_px[0])
         magnitudes = _sensor_magnitudes(resolved, self.options.colour_term)
         order = np.argsort(magnitudes, kind="stable")
         return dataclasses.replace(resolved.subset(order), v=magnitudes[order])
 
-    def _divided(self, seen: StarCatalog, deep: float) -> list[FeatureSearch]:
+    def _divided(self, sensor_stars: StarCatalog, deep: float) -> list[FeatureSearch]:
         """The searches of nine circles of the field, which share a database: the middle, and eight around it."""
         whole = self.database.parameters
         half = _CIRCLE_SHARE * math.radians(0.5 * whole.fov_deg)
@@ -185,9 +187,9 @@ class LsiIdentifier(VerifiedIdentifier):
             kappa=self._feature_limit(share),
         )
         deep = max(deep, parameters.kappa)
-        database = obtain_database(seen, parameters, cache=self.options.cache)
+        database = obtain_database(sensor_stars, parameters, cache=self.options.cache)
         lost_in_space = LostInSpace(database, solver=self.options.solver)
-        stars = sky_of(seen, dataclasses.replace(parameters, kappa=deep))
+        stars = sky_of(sensor_stars, dataclasses.replace(parameters, kappa=deep))
         ring = [
             half * np.array([math.sin(turn), -math.cos(turn), 0.0]) for turn in np.arange(8) * math.pi / 4.0
         ]

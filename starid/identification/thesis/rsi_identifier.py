@@ -181,18 +181,18 @@ class RsiIdentifier(SingleCameraIdentifier):
 
     def _identify(self, measured: CheckedDetections) -> Solution:
         """Find the attitude in the whole database, from the stars that the filter keeps."""
-        known = self.preprocess(measured.xy, measured.flux)
-        solution = self._whole_sky(measured, known)
+        prior = self.preprocess(measured.xy, measured.flux)
+        solution = self._whole_sky(measured, prior)
         self._remember(solution)
-        return dataclasses.replace(solution, features=known.add_to(solution.features))
+        return dataclasses.replace(solution, features=prior.add_to(solution.features))
 
     def _whole_sky(
-        self, measured: CheckedDetections, known: Preprocessed, first: tuple[FeatureAnswer, ...] = ()
+        self, measured: CheckedDetections, prior: Preprocessed, first: tuple[FeatureAnswer, ...] = ()
     ) -> Solution:
         """LSI, line 12 of algorithm 3: from the true stars and, if that fails, from all detections."""
         zero_points = self.lsi.zero_points(measured.flux)
-        solution = self.lsi.solve(measured, zero_points, first, known.true_stars)
-        if solution.valid or known.true_stars.all():
+        solution = self.lsi.solve(measured, zero_points, first, prior.true_stars)
+        if solution.valid or prior.true_stars.all():
             return solution
         unfiltered = self.lsi.solve(measured, zero_points)
         return unfiltered if unfiltered.valid else solution
@@ -203,23 +203,23 @@ class RsiIdentifier(SingleCameraIdentifier):
         The centre of the region is the last attitude, carried by the measured motion. Only without it, as after a
         missing image, is it the prediction given; the region is then at least as wide as the window.
         """
-        known = self.preprocess(measured.xy, measured.flux)
-        side = known.side_deg
-        if self._last is not None and known.rotation is not None:
-            centre = Attitude.from_matrix(known.rotation @ self._last.matrix)
+        prior = self.preprocess(measured.xy, measured.flux)
+        side = prior.side_deg
+        if self._last is not None and prior.rotation is not None:
+            centre = Attitude.from_matrix(prior.rotation @ self._last.matrix)
         else:
             centre = predicted
             if window_px is not None:
                 side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
         side = min(side, self.lsi.database.parameters.fov_deg)
         if self._exceeded:
-            solution = self._whole_sky(measured, known)
-            report = known.add_to(solution.features)
+            solution = self._whole_sky(measured, prior)
+            report = prior.add_to(solution.features)
         else:
-            field, answers = self._in_region(measured, known, centre, side)
-            local = None if field is None else self._accepted(measured, known, field, answers)
-            solution = self._whole_sky(measured, known, answers[:1]) if local is None else local
-            report = known.add_to(
+            field, answers = self._in_region(measured, prior, centre, side)
+            local = None if field is None else self._accepted(measured, prior, field, answers)
+            solution = self._whole_sky(measured, prior, answers[:1]) if local is None else local
+            report = prior.add_to(
                 solution.features,
                 triggered=local is None,
                 region_deg=side,
@@ -237,7 +237,7 @@ class RsiIdentifier(SingleCameraIdentifier):
             solution.valid and (features.refined or features.error_psi <= self._settings.tau)
         )
 
-    def _place_wrong(self, answer: FeatureAnswer, known: Preprocessed) -> float:
+    def _place_wrong(self, answer: FeatureAnswer, prior: Preprocessed) -> float:
         """Probability that the region is at another place of the sky, by Bayes' rule from the last image's.
 
         The features say something new only as far as other stars are seen: in proportion to the motion, up to a cell.
@@ -245,7 +245,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         errors = self.lsi.errors
         if errors is None:
             return self._wrong
-        new = min(known.translation_deg / self.lsi.database.grid.step_deg, 1.0)
+        new = min(prior.translation_deg / self.lsi.database.grid.step_deg, 1.0)
         odds = self._wrong / max(1.0 - self._wrong, _LEAST_WRONG)
         odds *= float(errors.ratio[errors.row(answer.error_psi)]) ** new
         return max(float(odds / (1.0 + odds)), _LEAST_WRONG)
@@ -300,7 +300,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         )
 
     def _in_region(
-        self, measured: CheckedDetections, known: Preprocessed, centre: Attitude, side_deg: float
+        self, measured: CheckedDetections, prior: Preprocessed, centre: Attitude, side_deg: float
     ) -> tuple[FieldStars | None, tuple[FeatureAnswer, ...]]:
         """The field's stars, and the answers of the cells of the region that are nearest to its features.
 
@@ -310,7 +310,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         search, zero_point = self.lsi.search, self.lsi.zero_point
         if zero_point is None:
             return None, ()
-        field = search.field_stars(measured.xy, measured.flux, zero_point).only(known.true_stars)
+        field = search.field_stars(measured.xy, measured.flux, zero_point).only(prior.true_stars)
         seen = search.features(field)
         if seen is None:
             return field, ()
@@ -322,7 +322,7 @@ class RsiIdentifier(SingleCameraIdentifier):
     def _accepted(
         self,
         measured: CheckedDetections,
-        known: Preprocessed,
+        prior: Preprocessed,
         field: FieldStars,
         answers: tuple[FeatureAnswer, ...],
     ) -> Solution | None:
@@ -334,7 +334,7 @@ class RsiIdentifier(SingleCameraIdentifier):
             if answer.error_psi > self._settings.tau:
                 continue
             if not self.options.refinement:
-                found = self.lsi.by_features_alone(answer, "rsi", self._place_wrong(answer, known))
+                found = self.lsi.by_features_alone(answer, "rsi", self._place_wrong(answer, prior))
                 return dataclasses.replace(found, mode="tracking")
             for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
                 if attitude is None:

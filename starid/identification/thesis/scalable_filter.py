@@ -115,7 +115,7 @@ class _Tracks:
     position: Array
     variance: Array
     brightness: Array
-    seen: Indices
+    sightings: Indices
     missed: Indices
     sums: Array
 
@@ -199,7 +199,7 @@ class TrackFilter:
         self._anchor = self._motions.composed(motion, self._anchor)
         self._update_tracks(positions, brightness, partner, motion)
         wandering = self._fixed_or_drifting()
-        genuine = (self._tracks.seen >= min(self.settings.confirm, self._frame)) & ~wandering
+        genuine = (self._tracks.sightings >= min(self.settings.confirm, self._frame)) & ~wandering
         true_now = np.zeros(len(frame), dtype=np.bool_)
         number = np.full(len(frame), -1, dtype=np.int64)
         matched = np.flatnonzero(partner >= 0)
@@ -209,7 +209,7 @@ class TrackFilter:
         fresh = self._new_tracks(positions[new], brightness[new])
         number[new] = fresh.number
         tracks = self._tracks
-        keep = (tracks.missed == 0) | ((tracks.missed < self.settings.history) & (tracks.seen > 1))
+        keep = (tracks.missed == 0) | ((tracks.missed < self.settings.history) & (tracks.sightings > 1))
         self._tracks = tracks.kept(keep).joined(fresh)
         self._suspect = np.concatenate([wandering[keep], np.zeros(len(fresh), dtype=np.bool_)])
         return TrackResult(true_now, number, motion)
@@ -243,7 +243,7 @@ class TrackFilter:
         tracks, settings = self._tracks, self.settings
         if len(tracks) < _MIN_OBJECTS or brightness.size < _MIN_OBJECTS:
             return None
-        voters = np.lexsort((tracks.brightness, -np.minimum(tracks.seen, 2)))[:MAX_VOTERS]
+        voters = np.lexsort((tracks.brightness, -np.minimum(tracks.sightings, 2)))[:MAX_VOTERS]
         brightest = np.argsort(brightness, kind="stable")[:MAX_VOTERS]
         start_motion, change = self._motions.start(self._last_motion)
         score = find_motion(
@@ -265,7 +265,7 @@ class TrackFilter:
         """Match tracks and objects; return the object of each track, or −1, and the refined motion."""
         tracks, settings = self._tracks, self.settings
         partner = np.empty(len(tracks), dtype=np.int64)
-        trusted = (tracks.seen > 1) & ~self._suspect
+        trusted = (tracks.sightings > 1) & ~self._suspect
         error = np.zeros(len(tracks))
         for turn in range(_REFITS):
             predicted = self._motions.moved(tracks.position, motion)
@@ -307,13 +307,13 @@ class TrackFilter:
         position[which] += gain[:, None] * (positions[objects] - position[which])
         variance[which] *= 1.0 - gain
         magnitude = old.brightness.copy()
-        magnitude[which] += (brightness[objects] - magnitude[which]) / (old.seen[which] + 1.0)
-        seen, missed = old.seen.copy(), old.missed + 1
-        seen[which] += 1
+        magnitude[which] += (brightness[objects] - magnitude[which]) / (old.sightings[which] + 1.0)
+        sightings, missed = old.sightings.copy(), old.missed + 1
+        sightings[which] += 1
         missed[which] = 0
         sums = _FADING * old.sums
         self._add_to_sums(sums, which, positions[objects])
-        self._tracks = _Tracks(old.number, position, variance, magnitude, seen, missed, sums)
+        self._tracks = _Tracks(old.number, position, variance, magnitude, sightings, missed, sums)
 
     def _fixed_or_drifting(self) -> Mask:
         """Whether each track is better explained as fixed on the sensor or drifting than as a star.
@@ -323,7 +323,7 @@ class TrackFilter:
         """
         tracks = self._tracks
         result = np.zeros(len(tracks), dtype=np.bool_)
-        old = np.flatnonzero(tracks.seen >= _SCATTER_FRAMES)
+        old = np.flatnonzero(tracks.sightings >= _SCATTER_FRAMES)
         if old.size <= _MIN_OBJECTS:
             return result
         n, t, tt, x, y, z, xx, tx, ty, tz, u, v, uu = tracks.sums[old].T

@@ -26,10 +26,10 @@ from starid.kernels.jit import compiled, inner_checked
 _DIFFERENCE_DEG = 1e-4
 _MAX_STEPS = 8
 _CONVERGED_DEG = 1e-7
-_AGREED = 1e-12
+_AGREEMENT = 1e-12
 _MAX_STARS = 2048
-_NEAR = 0.0075
-_SEEN = 0.9
+_NEAR_SHARE = 0.0075
+_SEEN_SHARE = 0.9
 _NO_STARS = np.empty((0, 2))
 
 
@@ -139,7 +139,7 @@ def share_seen(
     vector = np.empty(5)
     turn = theta - cell_features(arrays.sky, ra % 360.0, dec, sums, vector)
     c, s = math.cos(turn), math.sin(turn)
-    limit = (_NEAR * arrays.sky.frame[HALF_WIDTH]) ** 2
+    limit = (_NEAR_SHARE * arrays.sky.frame[HALF_WIDTH]) ** 2
     matched = 0
     for i in range(positions.shape[0]):
         x = c * positions[i, 0] + s * positions[i, 1]
@@ -183,7 +183,7 @@ def subcell_kernel(
     starts = 0
     best = math.inf
     for turn in range(-1, order.size):
-        if (not compares and best < _AGREED) or most >= _SEEN:
+        if (not compares and best < _AGREEMENT) or most >= _SEEN_SHARE:
             break
         cell = first if turn < 0 else cells[order[turn]]
         if cell < 0:

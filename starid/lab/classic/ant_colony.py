@@ -32,8 +32,8 @@ from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
 RADIUS_SHARE: Final = 0.3
 """Radius of a circle as a share of the width of the field."""
 
-LEAST: Final = 3
-MOST: Final = 14
+MIN_STARS: Final = 3
+MAX_STARS: Final = 14
 """Least and largest number of stars in a circle, with its centre."""
 
 ROUNDS: Final = 12
@@ -79,21 +79,21 @@ def shortest_path(chord: Array, count: int, path: Indices) -> float:
 
 @compiled_ieee
 def _paths(vectors: Array, radius: float) -> Paths:
-    """Lengths (m,), numbers of stars (m,), stars (m, `MOST`) and steps (m, `MOST` − 1) of the paths of all circles."""
+    """Lengths (m,), numbers of stars (m,), stars (m, `MAX_STARS`) and steps (m, `MAX_STARS` − 1) of the paths of all circles."""
     n = vectors.shape[0]
     polar, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
     length, size = np.empty(n, dtype=np.float32), np.empty(n, dtype=np.int8)
-    stars = np.zeros((n, MOST), dtype=np.uint16)
-    steps = np.zeros((n, MOST - 1), dtype=np.float32)
+    stars = np.zeros((n, MAX_STARS), dtype=np.uint16)
+    steps = np.zeros((n, MAX_STARS - 1), dtype=np.float32)
     path, chord, inside = (
-        np.empty(MOST, dtype=np.int64),
-        np.empty((MOST, MOST)),
-        np.empty(MOST, dtype=np.int64),
+        np.empty(MAX_STARS, dtype=np.int64),
+        np.empty((MAX_STARS, MAX_STARS)),
+        np.empty(MAX_STARS, dtype=np.int64),
     )
     filled = 0
     for centre in range(n):
         count = 1 + neighbours_of(vectors, centre, radius, polar, rows)
-        if count < LEAST or count > MOST:
+        if count < MIN_STARS or count > MAX_STARS:
             continue
         inside[0], inside[1:count] = centre, rows[: count - 1]
         for i in range(count):

@@ -43,7 +43,7 @@ from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
 ALIGNMENTS: Final = 3
 """Number of neighbours with which an observed pattern is aligned in turn."""
 
-KEPT: Final = 2
+MATCHES_PER_LOOKUP: Final = 2
 """Number of matches kept of each lookup."""
 
 HIT_RATE: Final = 0.5
@@ -58,7 +58,7 @@ def _lookup(
     directions, magnitude = seen
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     occupied = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
-    matches = np.empty((directions.shape[0] * ALIGNMENTS * KEPT, 2), dtype=np.int64)
+    matches = np.empty((directions.shape[0] * ALIGNMENTS * MATCHES_PER_LOOKUP, 2), dtype=np.int64)
     filled = 0
     hit, miss = math.log(HIT_RATE / fill), math.log((1.0 - HIT_RATE) / (1.0 - fill))
     for pivot in range(directions.shape[0]):
@@ -69,7 +69,7 @@ def _lookup(
                 break
             votes = np.zeros(stars, dtype=np.int32)
             cells = count_votes(table, polar, count, aligned, radius, occupied, votes)
-            for _ in range(KEPT):
+            for _ in range(MATCHES_PER_LOOKUP):
                 best = np.argmax(votes)
                 odds = votes[best] * hit + (cells - votes[best]) * miss
                 if odds > math.log(stars):

@@ -17,10 +17,10 @@ from starid.storage.plots import colours
 
 _LIMITS: Final = (0.3, 0.2, 0.1, 0.013, 0.008, 0.002)
 _MAP_SCALES: Final = (0.1, 1.0)
-_BEST: Final = 99.5
+_BEST_PERCENT: Final = 99.5
 _COMPARED_FROM: Final = 99.0
-_SAME: Final = 1e-6
-_AGREES: Final = 1e-4
+_CHANGE: Final = 1e-6
+_SMALL_RESIDUAL: Final = 1e-4
 _KINDS: Final = {
     "author_mse": "MSE, as the author ran it",
     "author_1se": "1SE, as the author ran it",
@@ -40,7 +40,7 @@ def compute(context: Context, part: Part) -> Results:
         values["grid"],
         rng=context.rng(str(values["grid"]), str(values["percent"])),
         roll_deg=float(values["roll"]),
-        every=1 if values["percent"] == _BEST else context.parameters["every"],
+        every=1 if values["percent"] == _BEST_PERCENT else context.parameters["every"],
         compares=values["grid"] == OFF and values["roll"] == 0.0 and values["percent"] >= _COMPARED_FROM,
     )
 
@@ -95,7 +95,7 @@ def _precision(e: Evaluation, percents: list[float]) -> None:
 
 def _compare_best(e: Evaluation, on: Results, off: Results) -> None:
     """Compare the database of 99.5 %, on and off the grid."""
-    where, elsewhere = f"p = {_BEST:g} %, on the grid", f"p = {_BEST:g} %, off the grid"
+    where, elsewhere = f"p = {_BEST_PERCENT:g} %, on the grid", f"p = {_BEST_PERCENT:g} %, off the grid"
     for limit in _LIMITS:
         e.compare(f"LSI (MSE), {where}: share with ε_f ≤ {limit:g}°", **shares(on, limit))
     e.compare(f"LSI (MSE), {where}: share with ε_f > 1°", **shares(on, 1.0, beyond=True))
@@ -149,7 +149,7 @@ def _compare_rolls(e: Evaluation, percent: float, rolls: list[float]) -> None:
         first, *others = (e.results[key] for key in keys)
         for what, author, printed in (("ε_ψ", "psi_author", "psi_mse"), ("ε_f", "f_author_mse", "f_mse")):
             changed = [
-                float(max(np.sum(np.abs(other[name] - first[name]) > _SAME) for other in others))
+                float(max(np.sum(np.abs(other[name] - first[name]) > _CHANGE) for other in others))
                 for name in (author, printed)
             ]
             e.compare(
@@ -171,8 +171,8 @@ def evaluate(e: Evaluation) -> None:
         frames = {"ra_deg": result["frames"][:, 0], "dec_deg": result["frames"][:, 1]}
         values = {name: values for name, values in result.items() if name != "frames"}
         e.write(f"errors_{key}.csv", frames | values)
-    off = e.results[f"p{_BEST:g}-{OFF}"]
-    _compare_best(e, e.results[f"p{_BEST:g}-{ON}"], off)
+    off = e.results[f"p{_BEST_PERCENT:g}-{OFF}"]
+    _compare_best(e, e.results[f"p{_BEST_PERCENT:g}-{ON}"], off)
     best = {
         reading: max(percents, key=lambda p: share(e.results[f"p{p:g}-{ON}"][f"f_{kind}"], 0.3))
         for reading, kind in (("author", "author_mse"), ("printed", "mse"), ("ours", "fine"))
@@ -182,10 +182,10 @@ def evaluate(e: Evaluation) -> None:
         quantity = f"LSI (MSE), {GRID_LABELS[grid]}: share with ε_f ≤ 0.3° for p = {{}} %"
         _compare_listed(e, quantity, [f"p{percent:g}-{grid}" for percent in percents], percents, words, 1)
     _compare_rolls(e, e.parameters["roll_percent"], e.parameters["rolls"])
-    agree = off["residual"] < _AGREES
+    agree = off["residual"] < _SMALL_RESIDUAL
     e.note = {
         "ambiguous": 100.0 * float(np.mean(agree & (off["f_fine"] > 0.01))),
         "lost": 100.0 * float(np.mean(~agree)),
         "stars": 100.0 * float(np.mean(off["f_stars"] > 0.01)),
-        "agrees": _AGREES,
+        "agrees": _SMALL_RESIDUAL,
     }

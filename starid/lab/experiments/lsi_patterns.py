@@ -19,7 +19,7 @@ _CASES: Final = {
 }
 _GROUPS: Final = {"root-both": "noise", "false": "false stars", "missing": "missing stars"}
 _TRIALS: Final = slice(559, 600)
-_LEAST: Final = 1e-6
+_PLOT_FLOOR: Final = 1e-6
 _STEP: Final = 0.01
 
 
@@ -42,7 +42,7 @@ def _draw_patterns(e: Evaluation, grid: str) -> None:
             f"{title}: {words}",
             Curve(
                 trials,
-                1.0 + np.log10(np.maximum(e.results[f"{case}-{grid}"][key][_TRIALS], _LEAST)),
+                1.0 + np.log10(np.maximum(e.results[f"{case}-{grid}"][key][_TRIALS], _PLOT_FLOOR)),
                 style,
                 label,
             ),

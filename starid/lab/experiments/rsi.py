@@ -19,7 +19,7 @@ from starid.lab.experiments.rsi_trials import (
     BY_TABLE,
     FIELDS,
     LSI_ONLY,
-    PRINTED,
+    PRINTED_SCALE,
     START,
     measured_step,
     method_of,
@@ -37,8 +37,8 @@ SETTLING: Final = 5
 _BYTES_PER_CELL: Final = 5
 _FIELD_DEG: Final = 40.0
 _PUBLISHED: Final = tuple(name for name in RECURSION[0.995, 0, 0.5] if name != "region_kB")
-_SHOWN: Final = 40
-_LEAST: Final = 1e-4
+_PLOTTED_FRAMES: Final = 40
+_PLOT_FLOOR: Final = 1e-4
 
 
 def parts(parameters: Parameters) -> list[Part]:
@@ -65,7 +65,7 @@ def compute(context: Context, part: Part) -> Results:
     v = part.values
     lsi = context.lost_in_space(v["overlap"])
     noise = identification_noise(v["factor"], false_stars=v["false_stars"])
-    if v["scale"] == PRINTED:
+    if v["scale"] == PRINTED_SCALE:
         noise = NoiseModel.of("both", v["factor"], false_stars=v["false_stars"])
     if v["tau"] == LSI_ONLY:
         settings = RsiSettings(tau=1.0, gamma_lsi_deg=1e-9)
@@ -152,7 +152,7 @@ def _compare(e: Evaluation, diagonal: Sequence[Part], figures: Mapping[str, dict
         means = {
             set_label(v): figures[part.key]["error_mean"]
             for part in e.parts
-            if (v := part.values)["overlap"] == overlap and v["memory"] and v["scale"] != PRINTED
+            if (v := part.values)["overlap"] == overlap and v["memory"] and v["scale"] != PRINTED_SCALE
         }
         worst = max(means, key=lambda words: means[words])
         quantity = f"greatest mean ε_f of all sets, p = {100 * overlap:g} %: RSI with memory (ours)"
@@ -193,17 +193,17 @@ def _set(part: Part) -> str:
 
 def _draw_frames(e: Evaluation, parts: Sequence[Part]) -> None:
     """Draw frame by frame ε_ψ and ε_f (figures 6.33 to 6.36, E), and run times (6.42, 6.43, G)."""
-    frames = np.arange(1, _SHOWN + 1)
+    frames = np.arange(1, _PLOTTED_FRAMES + 1)
     errors, times = [], []
     for part in parts:
-        numbers = dict(zip(FIELDS, e[part]["numbers"][:, :_SHOWN], strict=True))
+        numbers = dict(zip(FIELDS, e[part]["numbers"][:, :_PLOTTED_FRAMES], strict=True))
         tau, words = part["tau"], f"{_set(part)}, τ = {part['tau']:g}"
-        error, psi = (1.0 + np.log10(np.maximum(numbers[name], _LEAST)) for name in ("error", "psi"))
+        error, psi = (1.0 + np.log10(np.maximum(numbers[name], _PLOT_FLOOR)) for name in ("error", "psi"))
         hit = numbers["triggered"] > 0.0
         curves = [
             Curve(frames, error, "-", "1 + log₁₀ ε_f"),
             Curve(frames, psi, "--", "1 + log₁₀ ε_ψ"),
-            Curve(frames, np.full(_SHOWN, 1.0 + np.log10(tau)), ":", "τ"),
+            Curve(frames, np.full(_PLOTTED_FRAMES, 1.0 + np.log10(tau)), ":", "τ"),
             Curve(frames[hit], psi[hit], "v", "update triggered"),
         ]
         errors.append(Panel(words, curves, {"xlabel": "frame"}))

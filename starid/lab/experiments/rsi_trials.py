@@ -35,7 +35,7 @@ FIELDS: Final = (
 LSI_ONLY: Final = 0.0
 """Threshold τ for which every frame searches the whole database."""
 
-PRINTED: Final = 1.0
+PRINTED_SCALE: Final = 1.0
 """Scale of the noise as printed; another scale stands for scale·√μ (`author_noise`)."""
 
 BY_EQUATION, BY_TABLE = "equation", "table"
@@ -78,7 +78,7 @@ def method_of(tau: float, memory: int = 0, side: str = BY_EQUATION) -> str:
 
 def noise_label(scale: float) -> str:
     """Name of the noise of a scale."""
-    return "noise as printed" if scale == PRINTED else f"noise {scale:g}·√μ"
+    return "noise as printed" if scale == PRINTED_SCALE else f"noise {scale:g}·√μ"
 
 
 def set_label(values: Mapping[str, Any]) -> str:

@@ -151,3 +151,40 @@ def test_bad_values_are_rejected_in_one_line(
     assert text in output.err
     assert output.err.count("\n") == 1
     assert list(tmp_path.iterdir()) == [], "nothing is left behind"
+
+
+def test_an_orbit_moves_the_stars_by_aberration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At most 20.5 arcseconds by the Earth's orbit, 0.3 by its eccentricity, 5.2 by the satellite's, besides parallax up to 0.8."""
+    places = []
+    for orbit in ((), ("--orbit", "leo")):
+        options = (
+            "--profile",
+            "ideal",
+            "--ra",
+            "200",
+            "--dec",
+            "60",
+            "-o",
+            str(tmp_path / "sky.png"),
+            "--json",
+            *orbit,
+        )
+        assert run(monkeypatch, *options) == 0
+        stars = json.loads(capsys.readouterr().out)["stars"]
+        places.append({star["hip"]: (star["x_px"], star["y_px"]) for star in stars})
+    both = sorted(places[0].keys() & places[1].keys())
+    before, after = (DEFAULT_CAMERA.back_project(np.array([each[hip] for hip in both])) for each in places)
+    shifts = np.linalg.norm(after - before, axis=1) * 206_265.0
+    assert len(both) > 50
+    assert np.median(shifts) > 1.0
+    assert shifts.max() < 20.5 + 0.35 + 5.2 + 0.8
+
+
+def test_an_orbit_needs_a_profile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--ra", "200", "--dec", "60", "-o", str(tmp_path / "sky.png"), "--orbit", "leo")
+    assert run(monkeypatch, *options) != 0
+    assert "--profile" in capsys.readouterr().err

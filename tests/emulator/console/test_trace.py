@@ -6,7 +6,7 @@ import struct
 import pytest
 
 from starhil.emulator.console.pcapng import pcapng
-from starhil.emulator.console.trace import DECODED, WireTrace
+from starhil.emulator.console.trace import DECODED_LINES, WireTrace
 from starhil.emulator.links.traffic import Decoder, Traffic, WireItem, canopen_text
 from starhil.protocol.can.cubespace import encode_reply_frames, encode_request_frames
 from starhil.protocol.can.frame import CanFrame
@@ -117,10 +117,10 @@ def test_the_latest_items_are_decoded_once_however_many_pages_ask(monkeypatch):
         assert numbers(0) == [0, 1, 2, 3, 4]
         assert numbers(3) == [3, 4]
     assert len(decoded) == 5
-    pass_by(3 * DECODED)
+    pass_by(3 * DECODED_LINES)
     for _ in range(10):
-        assert numbers(0) == list(range(5 + 2 * DECODED, 5 + 3 * DECODED))
-    assert len(decoded) == 5 + DECODED
+        assert numbers(0) == list(range(5 + 2 * DECODED_LINES, 5 + 3 * DECODED_LINES))
+    assert len(decoded) == 5 + DECODED_LINES
 
 
 def test_frames_of_canopen_have_index_name_and_value():

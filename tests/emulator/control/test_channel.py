@@ -133,7 +133,7 @@ def test_a_slow_truth_file_holds_up_nothing_else(run, tmp_path, monkeypatch):
         assert go.wait(PATIENCE_S)
         return read_truth_file(*arguments, **options)
 
-    monkeypatch.setattr("starhil.emulator.truth.config.read_truth_file", slowly)
+    monkeypatch.setattr("starhil.emulator.truth.reading_process.read_truth_file", slowly)
 
     async def scenario(emulation, _line):
         async with Control(emulation) as control, Control(emulation) as other:

@@ -56,9 +56,8 @@ class LaterBackground:
         self.waiting.append((work, done))
 
     def catch_up(self):
-        waiting, self.waiting = self.waiting, []
-        for work, done in waiting:
-            run_at_once(work, done)
+        while self.waiting:
+            run_at_once(*self.waiting.pop(0))
 
 
 def test_a_reset_before_the_disk_has_parameters_keeps_them(make_bench, tmp_path):
@@ -269,3 +268,34 @@ def test_time_is_set_and_used_for_stamps(bench):
         1_800_000_000.300, abs=1e-6
     )  # half of 100 ms after the start
     assert attitude["time_set"]
+
+
+def test_saves_during_a_write_share_the_next_one(bench):
+    device, waiting, answers = bench.device, [], []
+    device._background = lambda work, done: waiting.append((work, done))
+    for number, exposure in enumerate(range(100, 200)):
+        device.parameters.set({"exposure": exposure})
+        device.save_parameters().when_done(lambda error, number=number: answers.append((number, error)))
+    assert (len(waiting), answers) == (1, [])
+    work, done = waiting.pop()
+    work()
+    done(None)
+    assert (len(waiting), answers) == (1, [(0, None)])
+    assert device.store.load()["parameters"]["exposure"] == 100
+    work, done = waiting.pop()
+    work()
+    done(None)
+    assert waiting == []
+    assert answers == [(number, None) for number in range(100)]
+    assert device.store.load()["parameters"]["exposure"] == 199
+
+
+def test_a_shared_write_that_fails_is_reported_to_all_who_wait_for_it(bench):
+    device, waiting, answers = bench.device, [], []
+    device._background = lambda _work, done: waiting.append(done)
+    for _ in range(3):
+        device.save_parameters().when_done(answers.append)
+    error = EmulatorError("full")
+    waiting.pop()(None)
+    waiting.pop()(error)
+    assert answers == [None, error, error]

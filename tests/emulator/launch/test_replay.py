@@ -105,7 +105,7 @@ def test_a_run_is_repeated_to_the_byte(record, clock, tmp_path):
 
 
 @pytest.mark.parametrize("clock", ["real", "stepped"])
-def test_faults_of_telemetry_and_waits_for_a_phase_are_repeated_to_the_byte(record, clock):
+def test_faults_of_telemetry_and_clock_and_waits_for_a_phase_are_repeated_to_the_byte(record, clock):
     faults = [
         {"row": "precise_attitude", "offset": {"q_x": 0.1}, "jump_deg": 3.0, "probability": 0.5},
         {"row": "device_status", "truncate": 1, "count": 3},
@@ -116,6 +116,9 @@ def test_faults_of_telemetry_and_waits_for_a_phase_are_repeated_to_the_byte(reco
         async with Control(emulation) as control:
             assert (await control.do("wait", phase="mid_frame"))["ok"]
             assert (await control.do("fault", telemetry=faults, phase="exposure"))["ok"]
+            assert (await control.do("fault", clock={"jump_s": -3.0, "drift_ppm": 80.0, "jitter_s": 0.005}))[
+                "ok"
+            ]
             assert (await control.do("wait", phase="readout"))["ok"]
         await talk_over_a_bad_wire(emulation)
         async with Control(emulation) as control:

@@ -4,11 +4,13 @@ import asyncio
 import csv
 import re
 import resource
+import time
 
 import pytest
 
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.profile import Profile, load_profile
@@ -561,3 +563,25 @@ def test_an_event_that_fails_is_logged_and_time_continues(run, caplog, clock):
     run(scenario, clock=clock, device={"boot_s": 0.1})
     assert "ZeroDivisionError" in caplog.text
     assert caplog.text.count("Traceback") == 0
+
+
+def test_a_run_that_was_asked_for_many_saves_ends_soon_with_the_last(run, tmp_path):
+    contents = []
+
+    async def scenario(emulation, _line):
+        device = emulation.device
+        save = device.store.save
+
+        def save_slowly(content):
+            contents.append(content)
+            time.sleep(0.05)
+            save(content)
+
+        device.store.save = save_slowly
+        for exposure in range(100, 200):
+            device.parameters.set({"exposure": exposure})
+            device.save_parameters()
+
+    run(scenario, clock="real", device={"boot_s": 0.1}, run={"clock": "real", "state_dir": str(tmp_path)})
+    assert len(contents) <= 3  # 5 s for each request alone
+    assert FileStore(tmp_path).load()["parameters"]["exposure"] == 199

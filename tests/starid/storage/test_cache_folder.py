@@ -53,6 +53,19 @@ def homeless(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "home", no_home)
 
 
+def test_where_no_temporary_folder_can_be_written_the_chosen_one_is_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a machine without room on any disk, too."""
+
+    def full() -> str:
+        raise FileNotFoundError("No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "gettempdir", full)
+    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
+    assert cache.cache_dir() == tmp_path
+
+
 def own_folder(temporary: Path) -> Path:
     return temporary / f"starhil-cache-{os.geteuid()}"
 

@@ -45,12 +45,20 @@ for rate in ((0.0, 0.0, 0.0), (0.0, 0.0052, 0.0), (0.01, 0.01, 0.0), (0.0, 0.03,
         request = replace(requests[0], index=index, truth=truth, predicted=predicted, exposure_s=exposure_s)
         answer = pipeline.handle(request)
         assert answer.valid or not bright, answer
+for faults in (
+    {"moon": {"ra_deg": 3.0, "dec_deg": 2.0}, "sun": {"ra_deg": 80.0, "dec_deg": 0.0}, "false_stars": 30, "cosmic_rays_s": 50.0},
+    {"earth": {"ra_deg": 0.0, "dec_deg": -70.0}, "obstructions": [{"share": 0.2}]},
+    {"earth": {"ra_deg": 5.0, "dec_deg": 0.0, "radius_deg": 2.0}, "blank": False},
+):
+    for predicted in (None, requests[0].truth.attitude):
+        answer = pipeline.handle(replace(requests[0], predicted=predicted, exposure_s=exposure_s, faults=faults))
+        assert not hasattr(answer, "text"), answer
 print(len(before), sorted(kernels() - before))
 """
 
 
 @pytest.mark.parametrize("profile", ["ideal", "cubestar"])
-def test_no_kernel_is_left_to_be_compiled_in_a_slew(profile):
+def test_no_kernel_is_left_to_be_compiled_in_a_slew_or_for_an_optical_fault(profile):
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, profile],
         capture_output=True,

@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import trapezoid
 
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
+from starhil.emulator.sensor.sky.area_light import Backdrop
 from starhil.emulator.sensor.sky.light import AreaPainter
-from starhil.emulator.sensor.sky.light_grid import Backdrop
 from starhil.emulator.sensor.sky.objects import LENS_SCATTER, EarthLimb, Moon, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -34,8 +34,8 @@ def light(objects: SkyObjects, sensor: SensorModel = SENSOR, camera: Camera = CA
     """Electrons/s in each pixel (h, w), without sky and dark current."""
     area = AreaPainter(camera, sensor.zero_magnitude_e_s, sensor.psf_sigma_px).paint(objects, ORION)
     zero = np.zeros((camera.height, camera.width), dtype=np.float32)
-    mean, ones = zero.copy(), np.ones(zero.shape, dtype=np.uint16)
-    area.draw(mean, Backdrop(zero, ones, 1.0, 0 * ones, 0.0, sky_e_s=0.0, exposure_s=1.0))
+    mean = zero.copy()
+    area.draw(mean, Backdrop(zero, np.ones_like(zero), sky_e_s=0.0, exposure_s=1.0))
     return mean
 
 

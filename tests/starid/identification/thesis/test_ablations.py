@@ -151,7 +151,9 @@ def test_without_motion_or_region_nothing_is_found_in_the_region(part):
 
 
 def test_an_unknown_part_is_rejected():
-    with pytest.raises(StaridError, match="no part 'sky'; there are features, weights, motion, region"):
+    with pytest.raises(
+        StaridError, match="no part 'sky'; there are features, weights, filter, motion, region"
+    ):
         checked_part("sky")
     assert checked_part(None) is None
     assert checked_part("region") == "region"
