@@ -102,6 +102,17 @@ def run_features(out: Path) -> str | None:
     )
 
 
+def first_light(out: Path) -> bool:
+    """Write an image of Orion with its identified stars marked; return whether that was possible."""
+    folder = Path(sys.executable).parent
+    image, marked = out / "orion.png", out / "first_light.png"
+    steps = (
+        [folder / "starhil", "render", "--profile", "demo", "--ra", "83.8", "--dec", "-1.2", "-o", image],
+        [folder / "starid", "identify", image, "--profile", "demo", "-o", marked],
+    )
+    return all(subprocess.run(step, check=False, stdout=subprocess.DEVNULL).returncode == 0 for step in steps)
+
+
 def within_limits(comparison: Comparison) -> bool:
     """Whether every sample of a session was valid and within the error limits."""
     return (
@@ -172,13 +183,17 @@ def main() -> int:
     if features is None:
         console.print("demo: the session with features failed; see its steps above", style="red")
         return 1
+    if not first_light(out):
+        console.print("demo: the image of Orion was not identified", style="red")
+        return 1
     truth = read_csv(truth_log)
     comparisons = {link: compare(read_csv(out / link / "attitude.csv"), truth) for link in SESSIONS}
     good = report(comparisons, console)
     console.print(features)
     console.print(
-        f"Images: {', '.join(map(str, sorted(out.rglob('*.png'))))}; logs in the same folders.\n"
-        "The images fill 235×235 and 469×469 pixels of the sizes that the unit downloads; the rest is black."
+        f"Open {out / 'first_light.png'}: the sky of the sensor, stretched, with the stars that were identified.\n"
+        f"Images that the OBC downloaded: {', '.join(map(str, sorted(out.rglob('image_*.png'))))}; logs in the same folders.\n"
+        "They fill 235×235 and 469×469 pixels of the sizes that the unit downloads; the rest is black."
     )
     console.print(
         "Next: .venv/bin/starhil run --serial auto --can off, then open the port of its ready line with your OBC software; "

@@ -24,8 +24,12 @@ if TYPE_CHECKING:
     from starid.catalog import StarCatalog
     from starid.photograph.solver import ImageSolution
 
-_NUMBERED_TO_MAGNITUDE = 3.0
+_NUMBERED_TO_MAGNITUDE = 5.0
 _SHOWN_STARS = 12
+_BRIGHTEST = 10
+"""Number of brightest detections of which the report says why they are not identified."""
+_AXIS_OFF_ARCSEC = 1.0
+"""Distance of the optical axis from the centre of the image from which both are shown."""
 ANY_FIELD = "auto"
 _TOLERANCE = 0.1
 TIME_LIMIT_S = 15.0
@@ -281,13 +285,14 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
         "reason": solution.reason.value,
         "advice": advice,
         "mirrored": result.mirrored,
-        **dict.fromkeys(("ra_deg", "dec_deg", "roll_deg", "quaternion_xyzw")),
+        **dict.fromkeys(("ra_deg", "dec_deg", "roll_deg", "quaternion_xyzw", "centre")),
         "stars": [],
         "stars_detected": len(detections.flux),
         "rms_px": None,
         "fov_deg": result.camera.fov_deg,
         **dict.fromkeys(("sigma_cross_arcsec", "sigma_roll_arcsec", "probability_false")),
         "missing_stars": [],
+        "unidentified": [],
         "elapsed_s": solution.elapsed,
     }
     if not solution.valid:
@@ -316,6 +321,8 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
         )
     ]
     return report | {
+        "centre": _centre(result),
+        "unidentified": _unidentified(result),
         "ra_deg": attitude.ra_deg,
         "dec_deg": attitude.dec_deg,
         "roll_deg": attitude.roll_deg,
@@ -332,6 +339,48 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
             )
         ],
     }
+
+
+def _centre(result: ImageSolution) -> dict[str, float]:
+    """Return where the centre of the image points, which the optical axis of a calibrated lens misses."""
+    import numpy as np
+
+    camera = result.camera
+    middle = np.array([[(camera.width - 1) / 2.0, (camera.height - 1) / 2.0]])
+    direction = camera.back_project(middle)[0]
+    x, y, z = result.solution.attitude.to_icrs(direction)
+    return {
+        "ra_deg": math.degrees(math.atan2(y, x)) % 360.0,
+        "dec_deg": math.degrees(math.asin(max(-1.0, min(1.0, z)))),
+        "off_axis_arcsec": 3600.0 * math.degrees(math.atan2(math.hypot(*direction[:2]), direction[2])),
+    }
+
+
+def _unidentified(result: ImageSolution) -> list[dict[str, Any]]:
+    """Return which of the brightest detections are not identified, and why as far as the image shows it."""
+    import numpy as np
+
+    detections, camera = result.detections, result.camera
+    brightest = np.argsort(-detections.flux, kind="stable")[:_BRIGHTEST]
+    identified = set(result.solution.detection_index.tolist())
+    xy = result.on_image(detections.xy_px)
+    rows = []
+    for index in brightest.tolist():
+        if index in identified:
+            continue
+        apart = np.hypot(*(detections.xy_px - detections.xy_px[index]).T)
+        apart[index] = math.inf
+        why = "not where the catalogue has a star: a planet, an aircraft, a reflection, a hot pixel"
+        if detections.saturated[index]:
+            why = "saturated, so its place is uncertain"
+        elif detections.edge[index]:
+            why = "cut off by the edge of the image"
+        elif apart.min() < 6.0 * detections.psf_sigma_px:
+            why = "close to another, so the two have one light"
+        elif not camera.project(camera.back_project(detections.xy_px[index][None]))[1][0]:
+            why = "outside the calibrated field of the lens"
+        rows.append({"x_px": float(xy[index, 0]), "y_px": float(xy[index, 1]), "why": why})
+    return rows
 
 
 def _marked(pixels: Any, result: ImageSolution) -> Any:
@@ -384,6 +433,12 @@ def _print_solution(report: dict[str, Any], console: Console) -> None:
         f"1σ {report['sigma_cross_arcsec']:.2f}″ across and {report['sigma_roll_arcsec']:.1f}″ about the boresight, "
         f"false with probability < {max(report['probability_false'], 1e-300):.1g}"
     )
+    centre = report["centre"]
+    if centre["off_axis_arcsec"] > _AXIS_OFF_ARCSEC:
+        console.print(
+            f"that is the optical axis, {centre['off_axis_arcsec'] / 60.0:.1f}′ from the centre of the image: "
+            f"RA {turn_text(centre['ra_deg'], 4)}°, Dec {centre['dec_deg']:.4f}°"
+        )
     if report["mirrored"]:
         console.print("the image is mirrored: roll and attitude refer to the image flipped left to right")
     if report["missing_stars"]:
@@ -392,6 +447,8 @@ def _print_solution(report: dict[str, Any], console: Console) -> None:
             f"{len(report['missing_stars'])} expected stars were not detected, the brightest HIP {brightest['hip']}, "
             f"V {brightest['v']:.1f}"
         )
+    for star in report["unidentified"]:
+        console.print(f"bright at ({star['x_px']:.0f}, {star['y_px']:.0f}) px, not identified: {star['why']}")
     table = Table("HIP", "name", "V", "x px", "y px", "flux", box=SIMPLE, title="brightest identified stars")
     for star in report["stars"][:_SHOWN_STARS]:
         place = (f"{star['x_px']:.2f}", f"{star['y_px']:.2f}", f"{star['flux']:.0f}")

@@ -170,6 +170,19 @@ class Solution:
         copy.__dict__.update(self.__dict__, elapsed=time.perf_counter() - begin)
         return copy
 
+    def __repr__(self) -> str:
+        """Return what it says in a few lines, for a notebook."""
+        if not self.valid:
+            return f"no attitude: {self.reason.value} ({self.mode}, {1e3 * self.elapsed:.1f} ms)"
+        attitude = self.attitude
+        return (
+            f"RA {attitude.ra_deg:.5f}°, Dec {attitude.dec_deg:.5f}°, roll {attitude.roll_deg:.4f}°\n"
+            f"quaternion ICRS→sensor, x y z w: {' '.join(f'{part:.9f}' for part in self.quaternion_xyzw)}\n"
+            f"1σ {self.cross_boresight_sigma_arcsec:.2f}″ across and {self.roll_sigma_arcsec:.2f}″ about the boresight\n"
+            f"{self.star_count} stars matched, rms {self.rms_px:.3f} px; {self.mode}, {1e3 * self.elapsed:.1f} ms\n"
+            f"false with a probability below {max(self.probability_false, 1e-300):.1g}"
+        )
+
     @cached_property
     def attitude(self) -> Attitude:
         """The attitude of a valid solution.

@@ -124,7 +124,7 @@ def processors() -> dict[str, Processor]:
                 ("OPENCV_CPU_DISABLE", "AVX512-SKX,AVX512-ICL,AVX512-COMMON"),
             ),
         ),
-        "arm64": Processor(before=tuple(ARM64)),
+        "arm64": Processor(before=tuple(ARM64), environment=(("NUMBA_CPU_NAME", "cortex-a72"),)),
     }
 
 

@@ -171,7 +171,7 @@ def readers_of(parent: int) -> list[int]:
 
 @pytest.mark.process
 def test_a_signal_ends_a_start_that_reads_a_long_file(tmp_path: Path) -> None:
-    rows = "".join(f"{t},0,0,0,1\n" for t in range(600_000))
+    rows = "".join(f"{t},0,0,0,1\n" for t in range(2_000_000))  # a minute of reading
     path = write(tmp_path / "long.csv", f"t,qx,qy,qz,qw\n{rows}")
     assert path.stat().st_size > AT_ONCE_BYTES
     settings = ["--set", "truth.kind=file", "--set", f"truth.path={path}", "--set", "run.worker=error_model"]

@@ -10,9 +10,13 @@ from typer.testing import CliRunner
 
 from starhil.emulator.cli import app as emulator
 from starid.attitude import Attitude
+from starid.camera import Camera
 from starid.cli import identify
 from starid.cli.app import build_app
 from starid.errors import StaridError
+from starid.identification.solution import Reason, Solution
+from starid.identification.star_identifier import make_identifier
+from starid.imaging.detection import detect
 
 RUNNER = CliRunner()
 DEGREE_LIMIT = 0.01
@@ -236,3 +240,43 @@ def test_with_a_dark_frame_the_stars_of_a_hot_sensor_are_found_and_no_more(tmp_p
     assert without["stars_detected"] > 1.4 * plain["stars_detected"]
     assert abs(found["stars_detected"] - plain["stars_detected"]) < 0.2 * plain["stars_detected"]
     assert found["ra_deg"] == pytest.approx(plain["ra_deg"], abs=1e-3)
+
+
+def test_the_centre_of_the_image_is_named_where_the_optical_axis_misses_it(tmp_path):
+    image, camera = tmp_path / "sky.png", tmp_path / "lens.toml"
+    lens = "width = 937\nheight = 937\nfocal_px = [1200.0, 1200.0]\ncentre_px = [468.0, 588.0]\n"
+    camera.write_text(f"[camera]\n{lens}", encoding="utf-8")
+    place = ["--profile", str(camera), "--ra", "83.8", "--dec", "-1.2"]
+    assert starhil("render", *place, "-o", str(image)).exit_code == 0
+    shown = starid("identify", str(image), "--profile", str(camera)).output
+    off_deg = np.degrees(np.arctan2(120.0, 1200.0))
+    assert f"that is the optical axis, {60.0 * off_deg:.1f}′ from the centre of the image" in shown
+    centre = answer(image, "--profile", str(camera))["centre"]
+    assert centre["off_axis_arcsec"] == pytest.approx(3600.0 * off_deg)
+    assert (centre["ra_deg"], centre["dec_deg"]) == pytest.approx((83.8, -1.2 + off_deg), abs=0.01)
+
+
+def test_a_bright_light_that_is_not_identified_is_explained(tmp_path):
+    image = tmp_path / "sky.png"
+    assert starhil("render", "--ra", "12", "--dec", "0", "-o", str(image)).exit_code == 0
+    pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+    rows, columns = np.mgrid[: pixels.shape[0], : pixels.shape[1]]
+    planet = 200.0 * np.exp(-((columns - 600.0) ** 2 + (rows - 300.0) ** 2) / (2.0 * 0.9**2))
+    cv2.imwrite(str(image), np.clip(pixels + planet, 0, 255).astype(np.uint8))
+    (light,) = answer(image)["unidentified"]
+    assert (light["x_px"], light["y_px"]) == pytest.approx((600.0, 300.0), abs=0.2)
+    assert "a planet" in light["why"]
+    assert "bright at (600, 300) px, not identified" in starid("identify", str(image)).output
+
+
+def test_a_solution_prints_as_five_lines(tmp_path):
+    image = tmp_path / "sky.png"
+    assert starhil("render", "--ra", "83.8", "--dec", "-1.2", "-o", str(image)).exit_code == 0
+    pixels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
+    camera = Camera.from_fov()
+    stars = detect(pixels)
+    lines = repr(make_identifier("geometric", camera).identify(stars.xy_px, stars.flux)).splitlines()
+    assert len(lines) == 5
+    assert lines[0].startswith("RA 83.8")
+    assert "″ across and " in lines[2]
+    assert repr(Solution.invalid(Reason.NO_MATCH)).startswith("no attitude: no_match")
