@@ -68,10 +68,11 @@ test: $(VENV)/.developer
 	@status=0; $(MAKE) --no-print-directory --jobs=$$(nproc) --keep-going --output-sync=target $(BESIDE) $(LANES:%=lane-%) || status=1; \
 		[ $$status = 0 ] && echo "all passed" || echo "some failed: see the lines FAILED and ERROR above"; \
 		$(BIN)/python tools/tier_table.py $(REPORTS); exit $$status
+# the tests call make themselves, which would speak of the jobs of this one
 lane-vcan0:
-	@REPORTS=$(REPORTS) nice tools/test_on_vcan $(BIN)/python
+	@env -u MAKEFLAGS REPORTS=$(REPORTS) nice tools/test_on_vcan $(BIN)/python
 lane-%:
-	@$(PRIORITY) $(BIN)/python -m pytest -m "not socketcan" --junit-xml=$(REPORTS)/$*.xml $(TESTS)
+	@env -u MAKEFLAGS $(PRIORITY) $(BIN)/python -m pytest -m "not socketcan" --junit-xml=$(REPORTS)/$*.xml $(TESTS)
 
 # of `check`, beside the tests that start processes: what computes for seconds, or waits for the clock or a peer
 LONG := $(addprefix tests/,process fuzzing conformance test_docs.py test_public_names.py) \
