@@ -183,8 +183,10 @@ def test_rsi_with_a_wrong_prediction_searches_the_whole_sky():
     attitude = Attitude.from_radec_roll(80.0, 10.0, 0.0)
     recursion = RsiIdentifier()
     recursion.identify(*points(rng, attitude))
-    solution = recursion.track(*points(rng, attitude), Attitude.from_radec_roll(250.0, -40.0, 0.0))
+    elsewhere = Attitude.from_radec_roll(150.0, 30.0, 0.0)  # no motion that the filter could measure
+    solution = recursion.track(*points(rng, elsewhere), Attitude.from_radec_roll(250.0, -40.0, 0.0))
     assert solution.valid
+    assert solution.attitude.error_to(elsewhere).total_arcsec < RIGHT_ARCSEC
     assert solution.mode == "lost_in_space"
     assert recursion.statistics.triggers == 1
 
