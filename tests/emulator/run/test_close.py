@@ -2,7 +2,6 @@
 
 import asyncio
 import threading
-from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -85,20 +84,19 @@ def test_a_last_write_that_fails_is_reported(run, tmp_path, monkeypatch, caplog)
     """The failure arrives in the event loop after the thread that writes has ended."""
 
     async def scenario(emulation, _line):
-        closing, shutdown = threading.Event(), ThreadPoolExecutor.shutdown
-
-        def wait_for_the_thread(executor, **options):
-            closing.set()
-            shutdown(executor, **options)
+        closing = threading.Event()
 
         def fail_slowly(_store, _content):
-            closing.wait()
+            closing.wait(PATIENCE_S)
             raise EmulatorError("no space left")
 
         monkeypatch.setattr(FileStore, "save", fail_slowly)
         command(emulation, "save_parameters")
-        monkeypatch.setattr(ThreadPoolExecutor, "shutdown", wait_for_the_thread)
-        await run.launched.close()
+        ending = asyncio.create_task(run.launched.close())
+        await turns()
+        assert not ending.done()
+        closing.set()
+        await ending
         return run.launched.failed
 
     state = {"clock": "real", "state_dir": str(tmp_path)}
