@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
+from starhil.emulator.profile import load_profile
 from starid.storage import cache
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import CAMERA
@@ -130,7 +131,7 @@ def test_warming_the_cache_starts_a_pipeline_that_needs_every_kernel_and_the_ind
     assert (status, said) == (0, "")
     assert out.startswith("0 kernels compiled in ")
     assert str(folder) in out
-    assert setup.read_text() == "True {'bodies': 'ephemeris'}"
+    assert setup.read_text() == f"True {load_profile('cubestar').sky}"
     assert index.read_text() == "4.2 1247.35 470.32"  # as in the profile
 
 
