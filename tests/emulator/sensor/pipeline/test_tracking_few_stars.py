@@ -29,7 +29,12 @@ def error_arcsec(result: FrameResult, truth: Attitude) -> float:
     return max(off.cross_boresight_arcsec, off.roll_arcsec)
 
 
-def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("largest_deg", "share"), [(WRONG_DEG, 0.6), (0.4, 0.95)])
+def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch, largest_deg: float, share: float) -> None:
+    """The larger the error that may be left, the more frames have an attitude; none that tracking adds is off by more.
+
+    What is solved as lost in space has that answer: a star that the edge cuts may turn it by more than it states.
+    """
     expose = Pipeline._expose
 
     def hidden(self: Pipeline, request: FrameRequest):
@@ -39,7 +44,7 @@ def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Pipeline, "_expose", hidden)
     device, as_lost = (
-        EcssDevice(EcssPlan("cubestar", ("device.tracking_error_deg=0.4",))),
+        EcssDevice(EcssPlan("cubestar", (f"device.tracking_error_deg={largest_deg}",))),
         EcssDevice(EcssPlan("cubestar", ("device.tracking_stars=0",))),
     )
     lost = tracked = 0
@@ -56,16 +61,17 @@ def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch) -> None:
         assert isinstance(without, FrameResult)
         assert isinstance(result, FrameResult)
         lost, tracked = lost + without.valid, tracked + result.valid
+        if result.valid and not without.valid:
+            assert error_arcsec(result, truth) < 3600.0 * largest_deg
         if result.valid:
-            assert error_arcsec(result, truth) < 3600.0 * WRONG_DEG
             assert result.tracked
             assert result.matched == len(result.stars)
         far = replace(guided, predicted=truth.rotated(np.radians(rng.uniform(-3.0, 3.0, 3))))
         answer = device.pipeline.handle(far)
         assert isinstance(answer, FrameResult)
-        assert not answer.valid or error_arcsec(answer, truth) < 3600.0 * WRONG_DEG
+        assert not answer.valid or error_arcsec(answer, truth) < 3600.0 * largest_deg
     assert lost < 0.7 * FRAMES
-    assert tracked > FRAMES * 0.95 - 3.0 * math.sqrt(FRAMES * 0.95 * 0.05)
+    assert tracked > FRAMES * share - 3.0 * math.sqrt(FRAMES * share * (1.0 - share))
 
 
 @pytest.mark.parametrize("rate_deg_s", [0.0, 2.0])
