@@ -133,7 +133,7 @@ def test_the_general_error_is_reported_in_error_mode_alone():
 
 
 @pytest.mark.parametrize(
-    "command", ["show  record", "set keep-alive on", "shwo record", "SHOW RECORD", "\x00\xff"]
+    "command", ["show  record", "set keep-alive on", "shwo record", "SHOW RECORD", "", "\x00\xff"]
 )
 def test_a_damaged_command_is_not_ready_and_the_next_one_is_answered(command):
     def scenario(unit: Emulated) -> None:
@@ -144,15 +144,6 @@ def test_a_damaged_command_is_not_ready_and_the_next_one_is_answered(command):
             assert answer == b"ERROR 1\r\n"
         assert is_ready(unit.ask(b"set keep-alive off\r"))
         assert sample(unit)[2] == 0b10
-
-    with_unit("st200", "serial", scenario)
-
-
-def test_empty_lines_are_no_commands():
-    def scenario(unit: Emulated) -> None:
-        assert unit.ask(b"\r" * 1000) == b""
-        assert is_ready(unit.ask(b"\r\rset keep-alive off\r\r"))
-        assert unit.bench.device.counters.telecommands == 1
 
     with_unit("st200", "serial", scenario)
 
