@@ -139,8 +139,9 @@ def main(kind: str, path: Path, out: IO[bytes]) -> None:
     except MemoryError:
         content = {"problems": [f"{kind} file {path}: cannot be read (not enough memory)"]}
     out.write(json.dumps(content).encode() + b"\n")
+    pipe: Any = SimpleNamespace(write=out.write)  # a file would be asked for its position
     for array in arrays:
-        np.save(out, array, allow_pickle=False)
+        np.lib.format.write_array(pipe, array, allow_pickle=False)
     out.flush()
 
 

@@ -146,6 +146,10 @@ class _Transport:
     def set_write_buffer_limits(self, high: int) -> None:
         """Take a limit."""
 
+    def is_closing(self) -> bool:
+        """It stays open."""
+        return False
+
     def get_write_buffer_size(self) -> int:
         """Nothing waits."""
         return 0

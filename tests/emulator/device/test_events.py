@@ -15,7 +15,7 @@ def events(make_bench, tmp_path):
     folder = tmp_path / "unit"
     shutil.copytree(UNITS_FOLDER / "cubestar", folder)
     rows = (
-        f"[[telemetry]]\nid = {130 + number}\nname = 'on_{event}'\ndoc = 'd'\nprovenance = 'ours'\n"
+        f"[[telemetry]]\nid = {145 + number}\nname = 'on_{event}'\ndoc = 'd'\nprovenance = 'ours'\n"
         f"unsolicited = ['{event}']\nfields = [{{ type = 'u8' }}]\n"
         for number, event in enumerate(EVENTS)
     )
