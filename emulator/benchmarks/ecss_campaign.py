@@ -24,10 +24,9 @@ from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming, PowerModel
 from starhil.emulator.device.surroundings import orbit_of
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.profile import load_profile
+from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.profile.pipeline_setup import pipeline_setup
 from starhil.emulator.sensor.model import SensorModel
-from starhil.emulator.sensor.pipeline.error_model import few_stars
 from starhil.emulator.sensor.pipeline.messages import (
     FrameRequest,
     FrameResult,
@@ -35,6 +34,7 @@ from starhil.emulator.sensor.pipeline.messages import (
     camera_constants,
 )
 from starhil.emulator.sensor.pipeline.pipeline import Pipeline
+from starhil.emulator.sensor.star_count import few_stars
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.unit import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
@@ -107,13 +107,20 @@ class EcssPlan:
         ]
         return [static, thermal, dated, rest, *varied]
 
-    def warning(self) -> str:
-        """Return a warning if the camera sees too few stars, or an empty text."""
+    def device(self) -> tuple[Profile, Parameters, Camera]:
+        """Return the profile, and the parameters and the camera of its device, as far as no pipeline is needed."""
         profile = load_profile(self.profile, self.overrides)
         icd = load_unit(profile.unit_source)
-        parameters = Parameters(icd, profile_defaults(profile, icd))
-        camera = Camera.from_dict(profile.camera_values).to_dict()
-        return few_stars(camera, SensorModel().with_(**profile.sensor), parameters)
+        return (
+            profile,
+            Parameters(icd, profile_defaults(profile, icd)),
+            Camera.from_dict(profile.camera_values),
+        )
+
+    def warning(self) -> str:
+        """Return a warning if the camera sees too few stars, or an empty text."""
+        profile, parameters, camera = self.device()
+        return few_stars(camera.to_dict(), SensorModel().with_(**profile.sensor), parameters)
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,7 +23,6 @@ from starhil.emulator.benchmarks.ecss_campaign import (
     REST,
     STATIC,
     THERMAL,
-    EcssDevice,
     EcssPlan,
 )
 from starhil.emulator.benchmarks.ecss_errors import (
@@ -38,7 +37,6 @@ from starhil.emulator.benchmarks.ecss_errors import (
 )
 from starhil.emulator.benchmarks.ecss_requirements import Figure, Requirement
 from starhil.emulator.benchmarks.report_files import as_html, as_pdf
-from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.model import SensorModel
 from starid.storage.files import write_atomically
 from starid.storage.results import Results
@@ -262,16 +260,14 @@ def _axes_of(line: ErrorLine) -> Iterator[tuple[str, Figure]]:
 
 def subject(plan: EcssPlan) -> dict[str, str]:
     """Return what a report is about: the camera and its settings, and what has produced the figures."""
-    profile = load_profile(plan.profile, plan.overrides)
-    device = EcssDevice(plan)
-    camera = device.pipeline.camera
+    profile, parameters, camera = plan.device()
     text = json.dumps(profile.model_dump(mode="json"), sort_keys=True)
     return {
         "profile": f"`{plan.profile}`{''.join(f', `{item}`' for item in plan.overrides)}",
         "checksum of the profile": f"SHA-256 {hashlib.sha256(text.encode()).hexdigest()[:16]}…",
         "camera": f"{camera.width} × {camera.height} pixels, {camera.fov_deg:.4g}° wide; focal length {camera.focal_px[0]:.5g} pixels",
         "aperture": f"{1000.0 * SensorModel().with_(**profile.sensor).aperture_m:.3g} mm",
-        "exposure": f"{1000.0 * device.exposure_s:g} ms, gain {device.gain:g}",
+        "exposure": f"{parameters['exposure']:g} ms, gain {parameters['analog_gain']:g}",
         "unit": profile.unit_source,
         "version": f"starhil {version('starhil')}",
         "seed": str(plan.seed),

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from starhil.emulator.benchmarks.campaign import CampaignPlan
     from starhil.emulator.benchmarks.ecss_campaign import EcssPlan
 
+_WITH_PROFILE: Final = ("frames", "seed", "profile", "setting")
+"""Options of a lost-in-space campaign that hold for a profile, too."""
+
 WORKERS_S: Final = 60
 """Time for which a Dask scheduler may be without workers."""
 
@@ -238,8 +241,8 @@ class PlanOptions:
             if self.setting:
                 raise typer.BadParameter("--set overrides a key of --profile; give one")
             return None
-        for item in fields(self)[-6:]:
-            if getattr(self, item.name) != item.default:
+        for item in fields(self):
+            if item.name not in _WITH_PROFILE and getattr(self, item.name) != item.default:
                 option = f"--{item.name.replace('_', '-')}"
                 raise typer.BadParameter(f"{option} and --profile exclude each other; use --set")
         return EcssPlan(self.profile, tuple(self.setting or ()), self.seed, rest_frames=self.frames)

@@ -37,8 +37,8 @@ from starhil.emulator.run.revival import PipelineRevival
 from starhil.emulator.run.tape import PipelineState
 from starhil.emulator.run.wiring import Wiring
 from starhil.emulator.sensor.model import SensorModel
-from starhil.emulator.sensor.pipeline.error_model import few_stars
 from starhil.emulator.sensor.pipeline.messages import IndexRequest, PipelineReady, camera_constants
+from starhil.emulator.sensor.star_count import few_stars
 from starhil.emulator.simulation.clock import Clock
 from starhil.emulator.simulation.guard import close_all
 from starhil.emulator.truth.truth import SensorTruth, Truth

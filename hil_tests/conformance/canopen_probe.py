@@ -296,8 +296,11 @@ class CanopenProbe(Probe):
         """
         self.send_request(b"\x80" + self._multiplexer + bytes.fromhex("00000008"))
         self.send_request(upload_request(0x1000, 0))
-        answers = {b"\x43\x00\x10\x00", b"\x80\x00\x10\x00"}
-        self.wait_for(SDO_RESPONSE + self.node, accept=lambda data: data[:4] in answers)
+        # the answer to an upload, with or without its size, or an abort; no segment of a block has these bits and this object
+        self.wait_for(
+            SDO_RESPONSE + self.node,
+            accept=lambda data: data[1:4] == b"\x00\x10\x00" and (data[0] >> 5 == 2 or data[0] == ABORT),
+        )
         self.drain()
 
     def expect_unreadable(self, index: int, subindex: int, *codes: int) -> None:

@@ -26,7 +26,7 @@ ApplicationStore: TypeAlias = Callable[[], Deferred | None]
 """Stores the parameters of the application; a `Deferred` is answered when this is done."""
 
 Ended: TypeAlias = Callable[[StorageError | None], None]
-"""Is told how a write has ended."""
+"""Called at the end of a write, with its error or None."""
 
 Background: TypeAlias = Callable[[Callable[[], None], Ended], None]
 """Performs a write, and then calls a function with its error or None, at once or later; in the order of the writes."""

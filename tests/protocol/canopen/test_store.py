@@ -120,7 +120,7 @@ def test_application_parameters_are_stored_by_the_application(new_bench, storage
 
 
 class SlowDisk:
-    """Writes when it is told to."""
+    """Keeps the writes until the test performs them."""
 
     def __init__(self):
         self.waiting = []
