@@ -105,6 +105,8 @@ class ConsoleServer:
         self._view_token = view_token
         self._turn = asyncio.Lock()
         self._opening = asyncio.Lock()
+        self._exporting = asyncio.Lock()
+        """Held while a thread makes an export: several would take the interpreter from the links."""
         self._files: dict[str, tuple[bytes, str]] = {}
         """Files of the page that have been read: compressed, and their tag."""
         self._runner: web.AppRunner | None = None
@@ -234,19 +236,28 @@ class ConsoleServer:
         return _download(text, "session.toml", "application/toml")
 
     async def _wire_log(self, request: web.Request) -> web.Response:
-        return _download(self._console(request).trace.candump(), "wire.log", "text/plain")
+        trace = self._console(request).trace
+        async with self._exporting:
+            text = await in_thread(trace.candump, trace.items())
+        return _download(text, "wire.log", "text/plain")
 
     async def _wire_text(self, request: web.Request) -> web.Response:
-        text = await in_thread(self._console(request).trace.text)
+        trace = self._console(request).trace
+        async with self._exporting:
+            text = await in_thread(trace.text, trace.items())
         return _download(text, "wire.txt", "text/plain")
 
     async def _wire_pcapng(self, request: web.Request) -> web.Response:
-        data = await in_thread(pcapng, self._console(request).trace.items())
+        trace = self._console(request).trace
+        async with self._exporting:
+            data = await in_thread(pcapng, trace.items())
         return _download(data, "wire.pcapng", "application/octet-stream")
 
     async def _record(self, request: web.Request) -> web.Response:
         """Return what is known of the last hour as an MCAP file."""
-        data = await self._console(request).recording()
+        console = self._console(request)
+        async with self._exporting:
+            data = await console.recording()
         return _download(data, "record.mcap", "application/octet-stream")
 
     async def _report(self, request: web.Request) -> web.Response:

@@ -5,6 +5,8 @@ import json
 import select
 import socket
 import struct
+import threading
+import time
 from contextlib import AsyncExitStack
 from dataclasses import replace
 
@@ -16,10 +18,13 @@ from starhil.emulator.console import server
 from starhil.emulator.console.console import Console
 from starhil.emulator.console.history import COLUMNS, MODES, History, Image
 from starhil.emulator.console.reported_runs import ReportedRuns
+from starhil.emulator.console.trace import WireTrace
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.traffic import Decoder, WireItem
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.rig.console_feed import RunFeed
+from starhil.protocol.can.frame import CanFrame
 from tests.emulator.conftest import PREVIEW
 from tests.emulator.console.pages import ALONG_X, OPTIONS, Page, column
 from tests.emulator.runs import command, read
@@ -630,6 +635,40 @@ def test_a_message_of_the_trace_is_returned_with_its_fields_and_what_sends_it(ru
             assert "set_mode mode=lost_in_space" in text
 
     run(scenario, options=OPTIONS)
+
+
+def test_exports_are_made_one_at_a_time_beside_the_loop_while_traffic_passes(run, monkeypatch):
+    """The trace as text failed when an item passed meanwhile, and a log of 20 000 frames took the loop 60 ms."""
+    making, threads = set(), []
+
+    async def scenario(emulation, _line):
+        item = WireItem(0.0, "can", False, CanFrame(0x04800104))
+        emulation.traffic.passed.emit(item)
+
+        def observed(method):
+            def make(self, *arguments):
+                making.add(method)
+                threads.append((threading.current_thread(), len(making)))
+                emulation.traffic.passed.emit(item)
+                time.sleep(0.05)
+                emulation.traffic.passed.emit(item)
+                try:
+                    return method(self, *arguments)
+                finally:
+                    making.discard(method)
+
+            return make
+
+        monkeypatch.setattr(Decoder, "line", observed(Decoder.line))
+        monkeypatch.setattr(WireTrace, "candump", observed(WireTrace.candump))
+        async with Page(emulation) as page:
+            log, text = await asyncio.gather(page.get("/wire.log"), page.get("/wire.txt"))
+        assert "04800104#" in log
+        assert "identification?" in text
+
+    run(scenario, options=OPTIONS)
+    assert threading.main_thread() not in {thread for thread, _ in threads}
+    assert {count for _, count in threads} == {1}
 
 
 def test_text_is_compressed(run):
