@@ -642,7 +642,7 @@ def test_exports_are_made_one_at_a_time_beside_the_loop_while_traffic_passes(run
     making, threads = set(), []
 
     async def scenario(emulation, _line):
-        item = WireItem(0.0, "can", False, CanFrame(0x04800104))
+        item = WireItem(0.0, "can", outgoing=False, item=CanFrame(0x04800104))
         emulation.traffic.passed.emit(item)
 
         def observed(method):

@@ -179,7 +179,7 @@ def test_nothing_runs_that_only_a_recording_names(tmp_path, unit_of_others, monk
 def test_no_camera_or_address_is_opened_that_only_a_recording_names(tmp_path, capture):
     """OpenCV opens addresses, and where it has GStreamer whole pipelines, which may write files."""
     with socket.create_server(("127.0.0.1", 0)) as server:
-        server.setblocking(False)
+        server.settimeout(0.0)
         named = capture.format(port=server.getsockname()[1]) if isinstance(capture, str) else capture
         folder = tmp_path / "recorded"
         prepare_recording(folder, Profile(images={"capture": named}), "")
