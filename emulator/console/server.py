@@ -280,7 +280,7 @@ class ConsoleServer:
         console = self._console(request)
         if sum(len(each.viewers) for each in self._consoles) >= MAX_VIEWERS:
             return web.Response(status=503, text=f"503: {MAX_VIEWERS} pages are already open\n")
-        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE)
+        socket = web.WebSocketResponse(autoping=False, heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE)
         await socket.prepare(request)
         if request.transport is not None:
             _limit_unsent(request.transport)
@@ -316,10 +316,15 @@ class ConsoleServer:
     async def _receive(
         self, console: Console, socket: web.WebSocketResponse, viewer: Viewer, tasks: set[asyncio.Task[None]]
     ) -> None:
-        """Execute the requests of a page until it closes."""
+        """Execute the requests of a page until it closes.
+
+        Pings and pongs have their turns too: aiohttp would answer a flood of them without leaving the loop.
+        """
         async for message in socket:
             await asyncio.sleep(PAGE_TURN_S)
             await self._wait_for_turn()
+            if message.type is WSMsgType.PING:
+                await socket.pong(message.data)
             if message.type is not WSMsgType.TEXT:
                 continue
             try:

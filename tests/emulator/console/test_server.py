@@ -533,6 +533,23 @@ def test_the_requests_of_a_page_come_at_most_so_often(run, monkeypatch):
     assert min(np.diff(times)) >= server.PAGE_TURN_S
 
 
+@pytest.mark.parametrize("kind", ["ping", "pong"])
+def test_pings_and_pongs_of_a_page_have_their_turns_like_requests(run, kind):
+    """Two pages that only sent pings held up replies on the bus by more than a second."""
+    count = 30
+
+    async def scenario(emulation, _line):
+        async with Page(emulation, field="view_only") as page:
+            begin_s = asyncio.get_running_loop().time()
+            for _ in range(count):
+                await getattr(page.socket, kind)(b"")
+            await page.ask(do="parameters")
+            return asyncio.get_running_loop().time() - begin_s
+
+    options = replace(OPTIONS, console=replace(OPTIONS.console, view_token="look"))
+    assert run(scenario, options=options) >= count * server.PAGE_TURN_S
+
+
 def test_a_page_that_comes_back_gets_the_rows_that_it_lacks_and_no_others(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
