@@ -12,7 +12,7 @@ import secrets
 import socket
 import sys
 import zlib
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, cast
 from urllib.parse import quote, urlsplit
@@ -65,6 +65,9 @@ TURN_S: Final = 0.002
 
 PAGE_TURN_S: Final = 0.01
 """Shortest time between two requests of a page, seconds."""
+
+EXPORT_PAUSE_S: Final = 0.2
+"""Shortest time between two exports, of any pages, seconds."""
 
 OPENING_S: Final = 0.05
 """Shortest time between two pages that open, seconds."""
@@ -237,26 +240,26 @@ class ConsoleServer:
 
     async def _wire_log(self, request: web.Request) -> web.Response:
         trace = self._console(request).trace
-        async with self._exporting:
+        async with self._export_turn():
             text = await in_thread(trace.candump, trace.items())
         return _download(text, "wire.log", "text/plain")
 
     async def _wire_text(self, request: web.Request) -> web.Response:
         trace = self._console(request).trace
-        async with self._exporting:
+        async with self._export_turn():
             text = await in_thread(trace.text, trace.items())
         return _download(text, "wire.txt", "text/plain")
 
     async def _wire_pcapng(self, request: web.Request) -> web.Response:
         trace = self._console(request).trace
-        async with self._exporting:
+        async with self._export_turn():
             data = await in_thread(pcapng, trace.items())
         return _download(data, "wire.pcapng", "application/octet-stream")
 
     async def _record(self, request: web.Request) -> web.Response:
         """Return what is known of the last hour as an MCAP file."""
         console = self._console(request)
-        async with self._exporting:
+        async with self._export_turn():
             data = await console.recording()
         return _download(data, "record.mcap", "application/octet-stream")
 
@@ -307,6 +310,13 @@ class ConsoleServer:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         return socket
+
+    @contextlib.asynccontextmanager
+    async def _export_turn(self) -> AsyncIterator[None]:
+        """Wait until no other export is being made, and the links have had the interpreter for a while."""
+        async with self._exporting:
+            await asyncio.sleep(EXPORT_PAUSE_S)
+            yield
 
     async def _wait_for_turn(self) -> None:
         """Wait until `TURN_S` have passed since the request before, of any page."""
