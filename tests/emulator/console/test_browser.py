@@ -141,7 +141,7 @@ def test_in_error_mode_no_attitude_is_shown_and_the_last_image_has_its_age(page)
     )
     stage = page.locator(".stage").evaluate("element => getComputedStyle(element).filter")
     assert stage == "grayscale(1)"
-    page.wait_for_function("() => starhil.charts.to > starhil.store.now + 1")  # the plots go on, to the present
+    page.wait_for_function("() => starhil.charts.to > starhil.store.now + 1")
     labels = page.evaluate(
         "(() => { const [time] = starhil.charts.plots.at(-1).u.axes; return time.values(null, time.splits()); })()"
     )
