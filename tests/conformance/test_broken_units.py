@@ -16,6 +16,8 @@ from tests.conformance.test_healthy import SUITES
 from tests.protocol.canopen.conftest import simulated_probe
 from tests.protocol.canopen.mutants import Mutant, load
 
+pytestmark = pytest.mark.long
+
 UNREADABLE = (
     (
         Mutant("empty heartbeat", "error-control", "error_control", "bytes([self._context.state]))\n            self._next", 'b"")\n            self._next'),

@@ -20,6 +20,8 @@ from tests.conformance.protocol_mutants import Edit, LostAimError, ProtocolMutan
 from tests.conformance.simulated import SimulatedUnit
 from tests.test_your_unit import written
 
+pytestmark = pytest.mark.long
+
 MUTANTS = read_mutants()
 SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
 MECHANISMS = (

@@ -10,6 +10,8 @@ import pytest
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.runner import run_case
 
+pytestmark = pytest.mark.long
+
 
 def mutant_names() -> list[str]:
     """Names of the mutants, without importing them: what pytest shows as the cases of the test."""
