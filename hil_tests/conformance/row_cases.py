@@ -322,9 +322,13 @@ def _set_and_read(command: Row, row: Row, places: Mapping[str, str], marks: byte
     tried = {name: list(_tried(command.named[name], before[name], marks, rng)) for name in places}
     if command.action == "set_parameters":
         attempts = [
-            (f"{command.name}.{name}", [before | {name: value} for value in values], 2 - (command.named[name].parameter in CONSTRAINED_PARAMETERS))
+            (
+                f"{command.name}.{name}",
+                [before | {name: value} for value in values],
+                1 if command.named[name].parameter in CONSTRAINED_PARAMETERS else 2,
+            )
             for name, values in tried.items()
-        ]  # fmt: skip
+        ]
     else:
         turns = range(max(map(len, tried.values())))
         whole = [{name: values[turn % len(values)] for name, values in tried.items()} for turn in turns]
