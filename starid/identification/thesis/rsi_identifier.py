@@ -18,7 +18,6 @@ import numpy as np
 
 from starid.arrays import Array, Mask
 from starid.attitude import Attitude
-from starid.attitude.wahba import solve_wahba
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.identification.options import RsiOptions
@@ -32,8 +31,9 @@ from starid.identification.thesis.lsi_identifier import (
     LsiIdentifier,
     report_of,
 )
+from starid.identification.thesis.parts import Parts
 from starid.identification.thesis.rsi import RsiSettings, region_side
-from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings, rays
+from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilterSettings, rays
 
 _MIN_MATCHES: Final = 3
 _ENOUGH_MATCHES: Final = 8
@@ -115,6 +115,8 @@ class RsiIdentifier(SingleCameraIdentifier):
         See `LsiIdentifier`.
     options
         By default `RsiOptions()`.
+    parts
+        The parts of the algorithm; by default those of the thesis.
     **changes
         Fields of `RsiOptions` to change.
     """
@@ -124,10 +126,12 @@ class RsiIdentifier(SingleCameraIdentifier):
         camera: Camera = DEFAULT_CAMERA,
         catalog: StarCatalog | None = None,
         options: RsiOptions | None = None,
+        parts: Parts | None = None,
         **changes: Any,
     ) -> None:
         options = dataclasses.replace(options or RsiOptions(), **changes)
-        self.lsi = LsiIdentifier(camera, catalog, options)
+        self._parts = parts or Parts()
+        self.lsi = LsiIdentifier(camera, catalog, options, self._parts)
         super().__init__(camera, self.lsi.catalog)
         self.options = options
         self._settings = RsiSettings(
@@ -139,7 +143,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         scale = math.degrees(1.0 / camera.focal_px[0])
         half_field = 0.5 * self.lsi.database.parameters.fov_deg
         self._filter = (
-            TrackFilter(
+            self._parts.false_star_filter(
                 TrackFilterSettings(
                     position_sigma_deg=options.position_sigma_px * scale,
                     brightness_sigma=0.3,
@@ -174,9 +178,8 @@ class RsiIdentifier(SingleCameraIdentifier):
         """Forget previous frames, the learned zero point and the statistics."""
         self.lsi.reset()
         self._before = self._last = None
+        self._wrong = 1.0
         self._exceeded = False
-        if self._filter is not None:
-            self._filter.reset()
         self.statistics = RsiStatistics()
 
     def _identify(self, measured: CheckedDetections) -> Solution:
@@ -289,7 +292,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         if len(pairs) < _MIN_MATCHES:
             return unknown
         then, now = _directions(before.positions[pairs[:, 0]]), _directions(frame.positions[pairs[:, 1]])
-        rotation = solve_wahba(now, then).matrix
+        rotation = self._parts.motion(then, now)
         distance_deg = np.degrees(np.linalg.norm(then @ rotation.T - now, axis=1))
         return Preprocessed(
             true_stars,
@@ -315,7 +318,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         if seen is None:
             return field, ()
         observations = search.doubtful_features(field) if self.options.refinement else [seen]
-        found = [search.answer_in_region(features, centre, side_deg) for features in observations]
+        found = [self._parts.region(search, features, centre, side_deg) for features in observations]
         answers = [answer for answer in found if answer is not None]
         return field, (*answers[:1], *sorted(answers[1:], key=lambda answer: answer.error_psi))
 
