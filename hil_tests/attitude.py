@@ -144,7 +144,9 @@ def attitude_in(row: Row, values: Mapping[str, Value]) -> Quaternion:
     if found is None:
         raise BenchError(f"row '{row.name}' reports no quaternion, Gibbs vector, MRPs or rotation vector")
     if any(
-        values[field.name] is False for field in row.named_fields.values() if field.value == "attitude.valid"
+        values.get(field.name) is False
+        for field in row.named_fields.values()
+        if field.value == "attitude.valid"
     ):
         raise BenchError(f"the attitude is not valid (reason {values.get('reason', '?')!s})")
     fields, rotation = found
