@@ -10,6 +10,8 @@ import pytest
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from tests.waiting import PATIENCE_S
 
+pytestmark = pytest.mark.long
+
 AHEAD = """
 import sys
 from starhil.emulator.sensor.pipeline import worker_process

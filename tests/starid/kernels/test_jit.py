@@ -22,6 +22,8 @@ from starid.kernels.jit import compiled, compiled_ieee, inner, inner_checked
 from starid.storage.cache import cached_files, remove
 from tests.waiting import PATIENCE_S
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("numba")]
+
 CALLER = """
 from other_kernels.inner import FACTOR, scaled
 from starid.kernels.jit import compiled
