@@ -25,7 +25,7 @@ device; at 921 600 baud they arrive in 3 ms."""
 SMALLEST_READ: Final = 8
 """Fewest bytes that a port reads per turn when they are much work, as lines of one byte are."""
 
-LONG_TURN_S: Final = 0.01
+LONG_TURN_S: Final = 0.005
 """Time that a turn takes if it was too much work: the next ones read half as much, seconds."""
 
 GRAIN_S: Final = 1e-6
