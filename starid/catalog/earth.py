@@ -15,7 +15,7 @@ from starid.arrays import Array, on_grid
 ASTRONOMICAL_UNIT_M: Final = 149_597_870_700.0
 DAY_S: Final = 86_400.0
 
-_POSITION_GRID_M: Final = 1.0
+_POSITION_GRID_M: Final = 0.25
 VELOCITY_GRID_M_S: Final = 2.0**-20
 """Velocities from `erfa` and SGP4 are multiples of this (`on_grid`)."""
 

@@ -71,9 +71,9 @@ class Observer:
         """Barycentric places (3, 3) of Earth, Sun and Moon, m, and then their velocities (3, 3), m/s, ICRS."""
         slot, since_s = divmod(self.unix_s, SLOT_S)
         share = since_s / SLOT_S
-        a, b, c, d = _cubics_of(int(slot)).reshape(4, 3, 3)
+        a, b, c, d, u, v, w = _polynomials_of(int(slot)).reshape(7, 3, 3)
         place = a + share * (b + share * (c + share * d))
-        velocity = (b + share * (2.0 * c + share * 3.0 * d)) / SLOT_S
+        velocity = u + share * (v + share * w)
         return np.stack([place, velocity])
 
     @cached_property
@@ -188,16 +188,26 @@ def planets_seen_by(observer: Observer) -> tuple[PointSource, ...]:
 
 
 @lru_cache(maxsize=2)
-def _cubics_of(slot: int) -> Vector:
-    """Coefficients (4, 9), m, of the barycentric places of Earth, Sun and Moon by the share of a slot that is over."""
+def _polynomials_of(slot: int) -> Vector:
+    """Coefficients of the barycentric places and velocities of Earth, Sun and Moon by the share of a slot that is over.
+
+    They are (4, 9), m, and (3, 9), m/s. The velocities are not the slopes of the places, which are on a grid (`in_metres`).
+    """
     first, rest = terrestrial_time(slot * SLOT_S)
-    (start, slope), (end, last_slope) = (_series(first, rest + k * SLOT_S / DAY_S) for k in (0, 1))
-    rise = end - start
-    return np.stack([start, slope, 3.0 * rise - 2.0 * slope - last_slope, slope + last_slope - 2.0 * rise])
+    (start, u), (_, middle), (end, last) = (
+        _series(first, rest + k * SLOT_S / DAY_S) for k in (0.0, 0.5, 1.0)
+    )
+    rise, slope, last_slope = end - start, SLOT_S * u, SLOT_S * last
+    return np.stack(
+        [
+            *(start, slope, 3.0 * rise - 2.0 * slope - last_slope, slope + last_slope - 2.0 * rise),
+            *(u, 4.0 * middle - 3.0 * u - last, 2.0 * (u + last) - 4.0 * middle),
+        ]
+    )
 
 
 def _series(first: float, rest: float) -> tuple[Vector, Vector]:
-    """Barycentric places (9,) of Earth, Sun and Moon at a terrestrial time, m, and their motion in a slot's length."""
+    """Barycentric places (9,) of Earth, Sun and Moon at a terrestrial time, m, and their velocities, m/s."""
     from erfa import moon98, ufunc
 
     heliocentric, barycentric = (in_metres(pv) for pv in ufunc.epv00(first, rest)[:2])
@@ -206,7 +216,7 @@ def _series(first: float, rest: float) -> tuple[Vector, Vector]:
         np.concatenate([earth, earth - about_sun, earth + about_earth])
         for earth, about_sun, about_earth in zip(barycentric, heliocentric, moon, strict=True)
     )
-    return place, SLOT_S * velocity
+    return place, velocity
 
 
 @lru_cache(maxsize=2)
