@@ -90,6 +90,20 @@ def from_rotation_vector(vector: Sequence[float]) -> Quaternion:
     return Quaternion(x, y, z, math.cos(0.5 * angle))
 
 
+def from_gibbs_vector(vector: Sequence[float]) -> Quaternion:
+    """Return the rotation whose Gibbs or Rodrigues vector, tan(φ/2) along its axis, is given."""
+    scalar = 1.0 / math.hypot(1.0, *vector)
+    x, y, z = (scalar * part for part in vector)
+    return Quaternion(x, y, z, scalar)
+
+
+def from_modified_rodrigues(parameters: Sequence[float]) -> Quaternion:
+    """Return the rotation whose modified Rodrigues parameters, tan(φ/4) along its axis, are given."""
+    square = math.fsum(part * part for part in parameters)
+    x, y, z = (2.0 * part / (1.0 + square) for part in parameters)
+    return Quaternion(x, y, z, (1.0 - square) / (1.0 + square))
+
+
 def rotation_vector(q: Sequence[float]) -> Vector:
     """Return the direction of the axis of a rotation times its angle, at most half a turn, rad."""
     x, y, z, w = q

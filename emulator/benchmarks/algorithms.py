@@ -207,23 +207,23 @@ class _Tally:
         self._in_region = self._triggers = 0
         self._kept = np.zeros((2, 2), dtype=np.int64)
         """Detections by whether they are false stars, and whether the filter kept them."""
-        self._bytes = 0
+        self._identifier: Any = None
 
     def add(self, image: _Image) -> None:
         """Identify the detections of an image."""
         pipeline, place = self._device.pipeline, image.number % self._scene.length
-        identifier: Any = pipeline.identifier(image.request)
-        self._bytes = int(identifier.database_bytes)
+        if self._identifier is None:
+            intact: Any = pipeline.identifier(image.request)
+            self._identifier = without(self._part, intact) if self._part else intact
         if place == 0:
             self._last = []
-            if hasattr(identifier, "reset"):
-                identifier.reset()
+            if hasattr(self._identifier, "reset"):
+                self._identifier.reset()
         expected = self._predicted(image.number) if self._scene.predicted else None
         request = replace(image.request, predicted=expected)
-        with without(self._part):
-            begin = time.thread_time()
-            solution = pipeline.solution(image.found, request)
-            elapsed_ms = 1e3 * (time.thread_time() - begin)
+        begin = time.thread_time()
+        solution = pipeline.solution(image.found, request, self._identifier)
+        elapsed_ms = 1e3 * (time.thread_time() - begin)
         if solution.valid:
             self._last = [*self._last[-1:], (image.number, solution.attitude)]
         if self._scene.second and place == 0:
@@ -285,7 +285,7 @@ class _Tally:
             "false_kept_pct": 100.0 * false[1] / false.sum() if false.sum() else None,
             "median_ms": float(np.median(self._ms)),
             "p99_ms": float(np.percentile(self._ms, 99)),
-            "kilobytes": self._bytes / 1000.0,
+            "kilobytes": self._identifier.database_bytes / 1000.0,
         }
 
 

@@ -29,6 +29,9 @@ SEQUENCES: Final = tuple(a + b + c for a, b, c in product("xyz", repeat=3) if a 
 GIMBAL_LOCK_RAD: Final = 1e-7
 """With a second Euler angle this near to where the first and third axes coincide, the third angle is 0."""
 
+SMALLEST_SCALAR: Final = 1e-12
+"""Smallest scalar part by which a Gibbs vector is divided."""
+
 
 @dataclass(frozen=True)
 class Reported:
@@ -63,6 +66,26 @@ class Reported:
         sine = math.sqrt(x * x + y * y + z * z)
         scale = 2.0 if sine == 0.0 else 2.0 * atan2(math.copysign(sine, w), abs(w)) / sine
         return (scale * x, scale * y, scale * z)
+
+    @property
+    def gibbs_vector(self) -> Triple:
+        """Gibbs or Rodrigues vector of the quaternion in the convention of the unit, tan(φ/2) along the axis.
+
+        It grows without bound towards half a turn, so that its length ends at about 10¹².
+        """
+        return self._vector_part_over(
+            math.copysign(max(abs(self.quaternion_xyzw[3]), SMALLEST_SCALAR), self.quaternion_xyzw[3])
+        )
+
+    @property
+    def modified_rodrigues(self) -> Triple:
+        """Modified Rodrigues parameters of the quaternion in the convention of the unit, tan(φ/4) along the axis, of at most 1."""
+        w = self.quaternion_xyzw[3]
+        return self._vector_part_over(w + math.copysign(1.0, w))
+
+    def _vector_part_over(self, divisor: float) -> Triple:
+        x, y, z, _ = self.quaternion_xyzw
+        return (x / divisor, y / divisor, z / divisor)
 
     def euler_rad(self, sequence: str) -> Triple:
         """Return the Euler angles that turn the ICRS axes to the reported axes, (3,), rad.

@@ -42,7 +42,9 @@ MAX_FAULTS: Final = 32
 Duration = Annotated[float, Field(ge=0.0, le=1e7)]
 Names = Annotated[list[str], Field(default_factory=list, max_length=100)]
 Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
-VECTOR_PART: Final = frozenset(f"attitude.{part}{axis}" for part in ("", "rotation_") for axis in "xyz")
+VECTOR_PART: Final = frozenset(
+    f"attitude.{part}{axis}" for part in ("", "rotation_", "gibbs_", "mrp_") for axis in "xyz"
+)
 """Quantities whose sign is that of the direction of the rotation."""
 
 

@@ -263,9 +263,11 @@ class Pipeline:
         """Return the star identifier for the parameters of a request."""
         return self._identifiers.build(self._identifier_setup(request))
 
-    def solution(self, detections: Detections, request: FrameRequest) -> Solution:
-        """Identify detections with the parameters of a request."""
-        return self._solve(self.identifier(request), detections, request)
+    def solution(
+        self, detections: Detections, request: FrameRequest, identifier: StarIdentifier | None = None
+    ) -> Solution:
+        """Identify detections with the parameters of a request, by default with the identifier of the device."""
+        return self._solve(identifier or self.identifier(request), detections, request)
 
     def _detect(self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel) -> Detections:
         return detect(*self._detection(exposure, request, sensor))

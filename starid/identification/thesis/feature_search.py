@@ -7,7 +7,7 @@ field is searched in several narrower circles, of which some contain no covered 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -120,6 +120,8 @@ class FeatureSearch:
         Rotation (3, 3) that carries the centre of the circle to the boresight.
     stars
         The stars with which the detections of a candidate are paired, fainter ones than those of the features too.
+    extract
+        Features of magnitudes (n,) and offsets from the centre of the circle (n, 2), pixels.
     """
 
     camera: Camera
@@ -127,6 +129,7 @@ class FeatureSearch:
     neighbours: int
     turn: Array
     stars: FrameSky
+    extract: Callable[[Array, Array], FeatureVector] = extract_features
 
     @property
     def database(self) -> FeatureDatabase:
@@ -163,14 +166,14 @@ class FeatureSearch:
     def features(self, field: FieldStars) -> FeatureVector | None:
         """Feature vector of the stars within the brightness limit; None if there are too few."""
         count = self.bright(field)
-        return None if count < MIN_STARS else extract_features(field.magnitude[:count], field.place[:count])
+        return None if count < MIN_STARS else self.extract(field.magnitude[:count], field.place[:count])
 
     def doubtful_features(self, field: FieldStars) -> list[FeatureVector]:
         """Feature vectors with some stars fewer or more, those nearest the brightness limit; the likeliest first."""
         count = self.bright(field)
         counts = [count + change for change in _COUNT_CHANGES]
         return [
-            extract_features(field.magnitude[:n], field.place[:n])
+            self.extract(field.magnitude[:n], field.place[:n])
             for n in counts
             if MIN_STARS <= n <= field.magnitude.size
         ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal, NamedTuple, get_args
@@ -32,6 +33,7 @@ from starid.kernels.jit import compiled, inner_checked
 from starid.matrices import product
 
 Precision = Literal["exact", "stored"]
+LassoPath = Callable[[Array, Array], Array]
 
 _WHOLE_SKY_DEG: Final = 720.0
 _CODES_PER_RADIAN: Final = 255.0 / (2.0 * math.pi)
@@ -434,6 +436,9 @@ class LostInSpace:
             "exact": the exact path of the LASSO. "matlab": as MATLAB's function `lasso` solves it by default,
             as for the published accuracy. "sklearn": nearest neighbours over the whole database and the LASSO
             of scikit-learn; the same answers, hundreds of times slower (`starid.identification.thesis.reference`).
+    weights
+        Another LASSO: from dictionary (5, 9) and observation (5,) to weights (k, 9), one row for each λ of `LAMBDAS`. By
+        default that of the solver.
 
     Raises
     ------
@@ -442,7 +447,12 @@ class LostInSpace:
     """
 
     def __init__(
-        self, database: FeatureDatabase, *, precision: Precision = "exact", solver: Solver = "exact"
+        self,
+        database: FeatureDatabase,
+        *,
+        precision: Precision = "exact",
+        solver: Solver = "exact",
+        weights: LassoPath | None = None,
     ) -> None:
         if precision not in ("exact", "stored"):
             raise DatabaseError(f"LSI: precision must be exact or stored, not {precision!r}")
@@ -455,6 +465,7 @@ class LostInSpace:
             self.arrays, database.features, database.theta, precision == "exact", solver == "matlab"
         )
         self._reference = ReferenceSearch(database) if solver == "sklearn" else None
+        self._weights = weights or (None if self._reference is None else reference_path)
 
     def solve(self, features: FeatureVector) -> LsiSolution:
         """Estimate boresight and roll from the features of a frame, searching the whole database."""
@@ -468,7 +479,7 @@ class LostInSpace:
         DatabaseError
             The observation is not five finite numbers.
         """
-        if self._reference is not None:
+        if self._weights is not None:
             return self.estimate(observation, *self.nearest(observation))
         self._check(observation)
         work = lsi_work()
@@ -522,11 +533,11 @@ class LostInSpace:
         """Compute dictionary, LASSO and estimates for a given cell."""
         self._check(observation)
         work = lsi_work()
-        if self._reference is None:
+        if self._weights is None:
             estimate_from_cell(self.searched, cell, observation, LAMBDAS, work)
         else:
             fill_dictionary(self.searched, cell, work)
-            path = reference_path(work.dictionary, observation)
+            path = self._weights(work.dictionary, observation)
             chosen = choose_lambdas(work.dictionary, observation, path, np.empty(LAMBDAS.size))
             estimate_from_path(self.searched, cell, observation, LAMBDAS, path, chosen, work)
         return _solution(observation, cell, distance, work)

@@ -45,6 +45,7 @@ from starid.identification.thesis.feature_search import (
     FieldStars,
 )
 from starid.identification.thesis.lsi import LostInSpace
+from starid.identification.thesis.parts import Parts
 
 STARS_PER_FIELD: Final = 10
 """Number of stars per field for the default brightness limit of the features: fewer make fields alike, and with more
@@ -100,6 +101,8 @@ class LsiIdentifier(VerifiedIdentifier):
         By default all of Hipparcos at its default epoch.
     options
         By default `LsiOptions()`.
+    parts
+        The parts of the algorithm; by default those of the thesis.
     **changes
         Fields of `LsiOptions` to change.
 
@@ -116,13 +119,14 @@ class LsiIdentifier(VerifiedIdentifier):
         camera: Camera = DEFAULT_CAMERA,
         catalog: StarCatalog | None = None,
         options: LsiOptions | None = None,
+        parts: Parts | None = None,
         **changes: Any,
     ) -> None:
         options = dataclasses.replace(options or LsiOptions(), **changes)
         super().__init__(camera, catalog)
         if len(self._catalog) == 0:
             raise StaridError("identifier catalog: contains no stars")
-        self.options = options
+        self.options, self._parts = options, parts or Parts()
         self._sensor_magnitudes = _sensor_magnitudes(self._catalog, options.colour_term)
         probe = DatabaseParameters.for_camera(camera, overlap=options.overlap, kappa=0.0)
         share = 0.5 * (1.0 - cos(math.radians(0.5 * probe.fov_deg)))
@@ -141,10 +145,11 @@ class LsiIdentifier(VerifiedIdentifier):
         stars = sky_of(sensor_stars, dataclasses.replace(parameters, kappa=deep))
         self.search = FeatureSearch(
             camera,
-            LostInSpace(self.database, solver=options.solver),
+            LostInSpace(self.database, solver=options.solver, weights=self._parts.weights),
             options.neighbours,
             np.identity(3),
             stars,
+            self._parts.features,
         )
         self._circles = self._divided(sensor_stars, deep) if options.divided else []
         self._given_zero_point = options.zero_point
@@ -188,7 +193,7 @@ class LsiIdentifier(VerifiedIdentifier):
         )
         deep = max(deep, parameters.kappa)
         database = obtain_database(sensor_stars, parameters, cache=self.options.cache)
-        lost_in_space = LostInSpace(database, solver=self.options.solver)
+        lost_in_space = LostInSpace(database, solver=self.options.solver, weights=self._parts.weights)
         stars = sky_of(sensor_stars, dataclasses.replace(parameters, kappa=deep))
         ring = [half * np.array([sin(turn), -cos(turn), 0.0]) for turn in np.arange(8) * math.pi / 4.0]
         return [

@@ -18,7 +18,6 @@ import numpy as np
 
 from starid.arrays import Array, Mask, elementwise
 from starid.attitude import Attitude
-from starid.attitude.wahba import solve_wahba
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.elementary import atan2, hypot, log10, power
@@ -33,8 +32,9 @@ from starid.identification.thesis.lsi_identifier import (
     LsiIdentifier,
     report_of,
 )
+from starid.identification.thesis.parts import Parts
 from starid.identification.thesis.rsi import RsiSettings, region_side
-from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings, rays
+from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilterSettings, rays
 from starid.matrices import lengths, product
 
 _MIN_MATCHES: Final = 3
@@ -117,6 +117,8 @@ class RsiIdentifier(SingleCameraIdentifier):
         See `LsiIdentifier`.
     options
         By default `RsiOptions()`.
+    parts
+        The parts of the algorithm; by default those of the thesis.
     **changes
         Fields of `RsiOptions` to change.
     """
@@ -126,10 +128,12 @@ class RsiIdentifier(SingleCameraIdentifier):
         camera: Camera = DEFAULT_CAMERA,
         catalog: StarCatalog | None = None,
         options: RsiOptions | None = None,
+        parts: Parts | None = None,
         **changes: Any,
     ) -> None:
         options = dataclasses.replace(options or RsiOptions(), **changes)
-        self.lsi = LsiIdentifier(camera, catalog, options)
+        self._parts = parts or Parts()
+        self.lsi = LsiIdentifier(camera, catalog, options, self._parts)
         super().__init__(camera, self.lsi.catalog)
         self.options = options
         self._settings = RsiSettings(
@@ -141,7 +145,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         scale = math.degrees(1.0 / camera.focal_px[0])
         half_field = 0.5 * self.lsi.database.parameters.fov_deg
         self._filter = (
-            TrackFilter(
+            self._parts.false_star_filter(
                 TrackFilterSettings(
                     position_sigma_deg=options.position_sigma_px * scale,
                     brightness_sigma=0.3,
@@ -176,9 +180,8 @@ class RsiIdentifier(SingleCameraIdentifier):
         """Forget previous frames, the learned zero point and the statistics."""
         self.lsi.reset()
         self._before = self._last = None
+        self._wrong = 1.0
         self._exceeded = False
-        if self._filter is not None:
-            self._filter.reset()
         self.statistics = RsiStatistics()
 
     def _identify(self, measured: CheckedDetections) -> Solution:
@@ -291,7 +294,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         if len(pairs) < _MIN_MATCHES:
             return unknown
         then, now = _directions(before.positions[pairs[:, 0]]), _directions(frame.positions[pairs[:, 1]])
-        rotation = solve_wahba(now, then).matrix
+        rotation = self._parts.motion(then, now)
         distance_deg = np.degrees(lengths(product(then, rotation.T) - now))
         return Preprocessed(
             true_stars,
@@ -317,7 +320,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         if seen is None:
             return field, ()
         observations = search.doubtful_features(field) if self.options.refinement else [seen]
-        found = [search.answer_in_region(features, centre, side_deg) for features in observations]
+        found = [self._parts.region(search, features, centre, side_deg) for features in observations]
         answers = [answer for answer in found if answer is not None]
         return field, (*answers[:1], *sorted(answers[1:], key=lambda answer: answer.error_psi))
 
