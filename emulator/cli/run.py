@@ -294,6 +294,7 @@ def command(
     from starhil.emulator.launch import Emulator, with_own_seeds
     from starhil.emulator.links.table import LINKS
     from starhil.emulator.profile import DEFAULT_PROFILE
+    from starhil.emulator.simulation.threads import run_loop
 
     levels = ("debug", "info", "warning", "error")
     if log not in levels:
@@ -316,7 +317,7 @@ def command(
             "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
         )
     options = around.run_options()
-    return asyncio.run(_serve(lambda: Emulator(profiles, options, worker)))
+    return run_loop(_serve(lambda: Emulator(profiles, options, worker)))
 
 
 async def _serve(make: Callable[[], Emulator]) -> int:

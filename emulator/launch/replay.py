@@ -227,7 +227,7 @@ async def replay(
 
     The device may have another profile than the recorded one, another unit, or other values of the recorded profile's keys
     (`settings`, as `section.key=value`); `run` except the algorithm, and `links`, are as recorded. A recorded unit with a
-    Python file of its own is rejected, because others may have made the recording.
+    Python file of its own, or camera, is rejected, because others may have made the recording.
     """
     recording_of = read_run(folder)
     recorded = recording_of.profile
@@ -235,6 +235,8 @@ async def replay(
         recorded = recorded.model_copy(update={"unit": unit})
     elif profile is None:
         check_runs_no_code(recorded.unit_source, f"replay {folder}: the recording")
+    if profile is None and not any(setting.startswith("images.capture") for setting in settings):
+        _check_opens_no_camera(recorded, folder)
     if settings and profile is None:
         profile = recorded.with_overrides(settings)
     player = Player(ends_at_once=recorded.run.clock == "stepped")
@@ -284,6 +286,19 @@ async def replay(
     if report.differences and (machine := other_machine(recording_of.machine)):
         report.differences.append(machine)
     return report
+
+
+def _check_opens_no_camera(recorded: Profile, folder: Path) -> None:
+    """Check that the images of a recording are not from a camera, file, address or pipeline that OpenCV would open.
+
+    Others may have named it, and it has other images now.
+    """
+    capture = recorded.images.capture
+    if capture != "":
+        raise EmulatorError(
+            f"replay {folder}: images.capture: the recording took images from {capture!r}, which it does not contain; give a "
+            "profile of your own: --profile"
+        )
 
 
 class _Playing:

@@ -141,7 +141,11 @@ def test_in_error_mode_no_attitude_is_shown_and_the_last_image_has_its_age(page)
     )
     stage = page.locator(".stage").evaluate("element => getComputedStyle(element).filter")
     assert stage == "grayscale(1)"
-    page.wait_for_function("() => starhil.charts.to > starhil.store.now + 1")  # the plots go on
+    page.wait_for_function("() => starhil.charts.to > starhil.store.now + 1")
+    labels = page.evaluate(
+        "(() => { const [time] = starhil.charts.plots.at(-1).u.axes; return time.values(null, time.splits()); })()"
+    )
+    assert labels == ["−60 s", "−50 s", "−40 s", "−30 s", "−20 s", "−10 s", "0"]
     assert send(page, "set_mode", mode="standby").startswith("accepted in ")
 
 

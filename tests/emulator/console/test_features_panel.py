@@ -43,6 +43,14 @@ def test_features_region_and_removed_detections_are_shown(page):  # noqa: F811
     )
     pairs = [value for pair in zip(shown["observed"], shown["of_cell"], strict=True) for value in pair]
     assert widths == pytest.approx([min(max(value, 0.0), 100.0) for value in pairs], abs=0.01)
+    outside = page.evaluate(
+        """() => {
+          const map = document.getElementById("map").getBoundingClientRect(), globe = document.querySelector(".globe").getBoundingClientRect();
+          const inside = (box) => box.left >= map.left && box.right <= globe.left && box.top >= map.top && box.bottom <= map.bottom;
+          return [...document.querySelectorAll("#features i, #features p")].filter((each) => !inside(each.getBoundingClientRect())).length;
+        }"""
+    )
+    assert outside == 0  # bars and text are in the panel, beside the map
     text = page.locator("#features p").text_content()
     assert "RSI, 2.0°" in text
     assert f"cell {shown['cell'] + 1} · {shown['weights']} weights" in text

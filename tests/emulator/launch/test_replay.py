@@ -10,6 +10,7 @@ import os
 import platform
 import re
 import shutil
+import socket
 
 import pytest
 
@@ -174,6 +175,22 @@ def test_nothing_runs_that_only_a_recording_names(tmp_path, unit_of_others, monk
     status, _, err = run_command_line("replay", str(folder), "--unit", "others/unit")
     assert mark.exists()
     assert f"{folder / EVENTS_FILE}: cannot be read" in err  # there is no tape
+
+
+@pytest.mark.parametrize("capture", [0, "http://127.0.0.1:{port}/night.avi"])
+def test_no_camera_or_address_is_opened_that_only_a_recording_names(tmp_path, capture):
+    """OpenCV opens addresses, and where it has GStreamer whole pipelines, which may write files."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0.0)
+        named = capture.format(port=server.getsockname()[1]) if isinstance(capture, str) else capture
+        folder = tmp_path / "recorded"
+        prepare_recording(folder, Profile(images={"capture": named}), "")
+        (folder / EVENTS_FILE).write_text('{"do": "end", "ns": 0}\n')
+        status, _, err = run_command_line("replay", str(folder))
+        with pytest.raises(BlockingIOError):
+            server.accept()
+    assert status == 2
+    assert f"took images from {named!r}, which it does not contain; give a profile of your own" in err
 
 
 def test_a_unit_of_toml_alone_is_replayed_from_where_it_was(tmp_path):

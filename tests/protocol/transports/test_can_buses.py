@@ -244,6 +244,22 @@ def test_only_classic_frames_are_received() -> None:
     asyncio.run(main())
 
 
+def test_a_controller_that_is_bus_off_again_and_again_is_reported_once() -> None:
+    """The kernel restarts it every few milliseconds, and each time was a line of the log."""
+
+    async def main() -> None:
+        bus_off = can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8))
+        restarted = can.Message(arbitration_id=0x100, is_error_frame=True, data=bytes(8))
+        frame = can.Message(arbitration_id=2, is_extended_id=False)
+        bus = _ScriptedBus(*[bus_off, restarted, frame] * 200)
+        transport, got, errors = await _open(bus)
+        await until(lambda: len(got) == 200)
+        await transport.close()
+        assert ["bus-off" in str(error) for error in errors] == [True]
+
+    asyncio.run(main())
+
+
 def test_frames_wait_while_the_transmit_buffer_is_full_and_none_beyond_the_limit() -> None:
     async def main() -> None:
         bus = _ScriptedBus()

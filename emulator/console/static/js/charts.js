@@ -225,7 +225,7 @@ export class Charts {
       padding: [0.4 * rem, 0.9 * rem, last ? 0 : 0.3 * rem, 0],
       scales: { x: { time: false, range: () => [this.from, this.to] }, y: { range: () => own.range } },
       axes: [
-        { ...axis, show: true, size: last ? 1.5 * rem : 2, splits: () => Array.from({ length: 7 }, (_, part) => this.to - ((this.to - this.from) * (6 - part)) / 6), values: (_, times) => times.map((time) => (last ? before(time - this.store.now) : "")) },
+        { ...axis, show: true, size: last ? 1.5 * rem : 2, splits: () => Array.from({ length: 7 }, (_, part) => this.to - ((this.to - this.from) * (6 - part)) / 6), values: (_, times) => times.map((time) => (last ? before(time - this.store.present) : "")) },
         { ...axis, size: 3.6 * rem, space: 1.6 * rem, values: (_, values) => values.map((item) => String(Number(item.toPrecision(6))).replace("-", "−")) },
       ],
       series,
@@ -282,7 +282,7 @@ export class Charts {
       [this.from, this.to] = this.zoomed;
       return;
     }
-    if (store.cursor === null) this.to = store.imageless ? store.time : store.now;
+    if (store.cursor === null) this.to = store.present;
     else {
       this.to = Math.min(this.to ?? store.now, Math.max(store.now, store.time));
       if (store.cursor > this.to) this.to = store.cursor;
