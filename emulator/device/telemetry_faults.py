@@ -70,7 +70,8 @@ class TelemetryFault(Strict):
     every_s: Duration | None = None
     """Period in which the fault returns."""
     freeze: Literal["attitude", "all"] | None = None
-    """What stays as in the first affected message: `attitude` (with its rates, stars, covariance and validity, while counters and times go on) or `all`."""
+    """What stays as in the first affected message: `attitude` (with its rates, stars, covariance and validity, while
+    counters and times go on) or `all`."""
     turn_deg: Annotated[list[Angle], Field(min_length=3, max_length=3)] | None = None
     """Turn the attitude and the star vectors by these angles about x, y and z of the sensor (a rotation vector); all flags stay good."""
     jump_deg: Annotated[float, Field(ge=0.0, le=180.0)] = 0.0

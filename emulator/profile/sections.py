@@ -294,7 +294,8 @@ class CanConfig(Strict):
     """The CAN link."""
 
     channel: str = "auto"
-    """`auto` (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a python-can channel, or `off`."""
+    """`auto` (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a python-can
+    channel, or `off`."""
     address: Annotated[int, Field(ge=1, le=254)] = 4
     """CAN address of the device."""
     host_address: Annotated[int, Field(ge=1, le=254)] = 1

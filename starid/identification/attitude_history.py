@@ -43,7 +43,10 @@ class AttitudeHistory:
     def add(
         self, at: float, attitude: Attitude, longest_gap_s: float, covariance: Array | None = None
     ) -> None:
-        """Add an attitude, with the covariance (3, 3) of its error, rad², if known; older ones are discarded after an interruption, after a longer gap, or if time has not passed."""
+        """Add an attitude, with the covariance (3, 3) of its error, rad², if known.
+
+        Older ones are discarded after an interruption, after a longer gap, or if time has not passed.
+        """
         follows = self._fixes and 0 < at - self._fixes[-1][0] <= longest_gap_s * self._per_second
         if self._interrupted or not follows:
             self._fixes.clear()

@@ -9,7 +9,8 @@ of a frame depends only on the request and the seed:
   by more than `validation_margin` pixels within the field fails with `no_match`; a predicted attitude beyond
   `tracking_margin` plus `search_width` pixels fails with `prediction_lost`.
 - Otherwise the brightest `REPORTED_STARS` are somewhere in the field, measured with the error of a centroid; their
-  numbers and magnitudes are chance. Each axis of the attitude's error is normal, cut off at `LARGEST_SIGMA`, with the stated standard deviation.
+  numbers and magnitudes are chance. Each axis of the attitude's error is normal, cut off at `LARGEST_SIGMA`, with the
+  stated standard deviation.
 """
 
 from __future__ import annotations

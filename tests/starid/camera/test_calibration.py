@@ -21,6 +21,8 @@ from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.photograph.self_calibration import IMAGE_MODELS, Stars, _best, self_calibrate
 
+pytestmark = pytest.mark.long
+
 WIDE = Camera(937, 937, (1230.0, 1226.0), (474.0, 463.0), "pinhole", (-0.06, 0.03, 8e-4, -5e-4, 0.0))
 NARROW = Camera(1024, 768, (5100.0, 5100.0), (512.0, 384.0), "pinhole", (-0.5, 0.0, 0.0, 0.0, 0.0))
 FISHEYE = Camera(937, 937, (600.0, 600.0), (460.0, 473.0), "equidistant", (-0.02, 0.005, 2e-4, 1e-4, 0.0))

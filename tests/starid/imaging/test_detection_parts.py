@@ -38,6 +38,8 @@ from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
 from starid.imaging.trail_flow import fit_flow, lengths_and_mismatches, trail_at, trail_shifts
 
+pytestmark = pytest.mark.long
+
 RNG_SEED = 12
 
 

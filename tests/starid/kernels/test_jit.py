@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +21,8 @@ from starid.kernels import kernel_cache
 from starid.kernels.jit import compiled, compiled_ieee, inner, inner_checked
 from starid.storage.cache import cached_files, remove
 from tests.waiting import PATIENCE_S
+
+pytestmark = [pytest.mark.long, pytest.mark.lowest("numba")]
 
 CALLER = """
 from other_kernels.inner import FACTOR, scaled
@@ -184,6 +187,35 @@ def test_files_without_a_checksum_are_kept_while_their_process_may_run(cache_fol
     os.utime(old, (time.time() - 7200.0,) * 2)
     kernel_cache.remove_damaged(folder)
     assert (new.exists(), old.exists()) == (True, False)
+
+
+def test_what_a_process_replaces_while_another_one_records_is_kept(
+    cache_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of processes that started together, the last one to write had read the file before: all was compiled again."""
+    folder = cache_folder / "kernels" / "0123456789abcdef"
+    path = folder / "package" / "kernel.nbc"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"code of the first")
+    read, others = kernel_cache._checksum, []
+
+    def replace() -> None:
+        path.write_bytes(b"code of the second")
+        kernel_cache.record_checksums(folder)
+
+    def checksum(file: Path) -> int:
+        found = read(file)
+        if not others:
+            others.append(threading.Thread(target=replace))
+            others[0].start()
+            others[0].join(1.0)
+        return found
+
+    monkeypatch.setattr(kernel_cache, "_checksum", checksum)
+    kernel_cache.record_checksums(folder)
+    others[0].join()
+    kernel_cache.remove_damaged(folder)
+    assert path.exists()
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", '{"package/gone.nbc": 1}'])
