@@ -63,7 +63,10 @@ def lengths(vectors: Array) -> Array:
 
 
 def inverse(matrices: Array) -> Array:
-    """Return the inverses of matrices (…, k, k) that are triangular or symmetric and positive definite, by Gauss–Jordan elimination without pivots."""
+    """Return the inverses of matrices (…, k, k) that are triangular, or symmetric and positive definite.
+
+    By Gauss–Jordan elimination without pivots.
+    """
     size = matrices.shape[-1]
     table = np.concatenate([matrices, np.broadcast_to(np.eye(size), matrices.shape)], axis=-1)
     for k in range(size):
