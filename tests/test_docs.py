@@ -45,6 +45,8 @@ from starid.catalog import load_catalog
 from tests.emulator.cli.command_line import run_command_line
 from tests.waiting import PATIENCE_S
 
+pytestmark = pytest.mark.long
+
 DOCS = Path(__file__).parents[1] / "docs"
 UNASKED = {0x0CE60401, 0x185}
 """Unsolicited telemetry, and the status that a change of mode sends: they may come between any two frames."""

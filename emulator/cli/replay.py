@@ -64,9 +64,9 @@ def command(
 ) -> int:
     """Replay a recorded run on the stepped clock and compare everything that the device sends and measures.
 
-    A recording contains its profile; --set and --orbit change it, or the one given by --profile. If messages differ, a table
-    lists their fields: in how many messages, by how much, and when first. The exit status is 0 if all bytes are identical, 1 if anything differs or is missing,
-    and 2 if the recording cannot be played.
+    A recording contains its profile; --set and --orbit change it, or the one given by --profile. If messages differ, a
+    table lists their fields: in how many messages, by how much, and when first. The exit status is 0 if all bytes are
+    identical, 1 if anything differs or is missing, and 2 if the recording cannot be played.
     """
     import asyncio
 

@@ -92,7 +92,8 @@ class DeviceOptions:
         str | None,
         Key("links.can.channel"),
         typer.Option(
-            help="CAN link: auto (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a channel, or off. Default: the profile's (auto)."
+            help="CAN link: auto (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a "
+            "channel, or off. Default: the profile's (auto)."
         ),
     ] = None
     canopen: Annotated[

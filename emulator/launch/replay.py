@@ -173,7 +173,10 @@ class PlayedPipeline:
         await self._inner.settle()
 
     async def deliver(self, ended: PipelineEnded | None) -> None:
-        """Deliver the next reply, or `ended` in its place; _DeviationError if the device has sent fewer requests than in the recorded run."""
+        """Deliver the next reply, or `ended` in its place.
+
+        _DeviationError if the device has sent fewer requests than in the recorded run.
+        """
         if not self._arrived:
             await self._inner.settle()
         if not self._arrived:

@@ -4,7 +4,8 @@ Whoever makes such a file decides how long it takes to read, how much memory tha
 does with it. Here none of this delays a reply, keeps the run from its end, or ends it: the process has half of the
 machine's memory, and ends with the one that has started it.
 
-It writes one line of JSON, either the problems, or what is not an array and the number of arrays; and then the arrays, as `numpy.save` does.
+It writes one line of JSON, either the problems, or what is not an array and the number of arrays; and then the arrays,
+as `numpy.save` does.
 """
 
 from __future__ import annotations

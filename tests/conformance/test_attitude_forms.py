@@ -23,6 +23,8 @@ from starid.attitude import Attitude
 from tests.conformance.links import LINKS, ROWS
 from tests.conformance.simulated import SimulatedUnit
 
+pytestmark = pytest.mark.long
+
 RADEC_ROLL = (211.0, 48.0, 77.0)
 TRUTH = from_radec_roll(*RADEC_ROLL)
 HALF_TURN = from_radec_roll(91.0, 0.0, 180.0)

@@ -14,6 +14,8 @@ from starhil.hil_tests.conformance.report import print_outcome, print_summary
 from starhil.hil_tests.conformance.runner import Outcome, not_run, run_case, run_cases, select_cases
 from starhil.hil_tests.errors import BenchError
 
+pytestmark = pytest.mark.long
+
 
 def case(case_id: str, run=lambda _probe: None, *, intrusive: bool = False) -> Case:
     return Case(

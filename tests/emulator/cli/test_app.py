@@ -16,6 +16,8 @@ from starhil.emulator.cli.run import DeviceOptions
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.workers import NEVER_READY
 
+pytestmark = pytest.mark.lowest("typer")
+
 
 @pytest.mark.parametrize(
     ("error", "said"),

@@ -30,6 +30,8 @@ from tests.emulator.console.pages import ALONG_X, OPTIONS, Page, column
 from tests.emulator.runs import command, read
 from tests.waiting import until
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("aiohttp")]
+
 
 @pytest.mark.parametrize(
     "path", ["/", "/runs", "/ws", "/session.toml", "/wire.log", "/wire.txt", "/record.mcap", "/docs/console"]

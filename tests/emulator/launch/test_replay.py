@@ -30,6 +30,8 @@ from tests.emulator.runs import CAMERA, Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
 from tests.waiting import PATIENCE_S, until
 
+pytestmark = pytest.mark.long
+
 PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 5.0}
 ROUNDS = 10
 

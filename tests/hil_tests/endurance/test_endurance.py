@@ -38,6 +38,8 @@ from starhil.protocol.icd.codec import Row
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
 
+pytestmark = pytest.mark.long
+
 LIVES, STEPS = 2, 150
 """Of each unit; `make years` has many more."""
 ROOT = Path(__file__).parents[3]

@@ -28,6 +28,8 @@ from tests.protocol.export.test_export import by_name, packets
 from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
 from tests.test_your_unit import written
 
+pytestmark = pytest.mark.long
+
 ICD = load_unit()
 ROWS = [row for row in ICD.rows if row.named_fields]
 KINDS = ["none", "telemetry", "ack", "nack", "unsolicited", "event", "burst", "fault"]

@@ -22,6 +22,8 @@ from starhil.protocol.transports.python_can import QUEUE_LIMIT, PythonCanTranspo
 from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, CanPair, can_pair
 from tests.waiting import PATIENCE_S, until
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("python-can")]
+
 MARK = CanFrame(0x7A5, b"end", extended=False)
 
 

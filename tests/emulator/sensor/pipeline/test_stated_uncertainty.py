@@ -16,6 +16,8 @@ from starhil.emulator.benchmarks.ecss_campaign import Condition, EcssDevice, Ecs
 from starhil.emulator.sensor.pipeline.messages import FrameResult
 from starid.attitude import ARCSEC_PER_RAD, Attitude
 
+pytestmark = pytest.mark.long
+
 SIGMAS = 4.0
 """Tolerance in standard deviations of the mean."""
 

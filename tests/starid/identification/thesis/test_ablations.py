@@ -16,6 +16,8 @@ from starid.identification.thesis.ablations import checked_part, without
 from starid.identification.thesis.lsi_identifier import LsiIdentifier
 from starid.identification.thesis.rsi_identifier import RsiIdentifier
 
+pytestmark = pytest.mark.long
+
 ZERO_POINT = 20.3
 LIMIT = 6.0
 SENSOR = {"zero_point": ZERO_POINT, "detected_limit": LIMIT, "magnitude_sigma": 0.03}
