@@ -351,7 +351,7 @@ def sources() -> Iterator[Path]:
 
 
 def test_only_what_numba_publishes_is_used_and_sums_are_never_reordered() -> None:
-    """numba is imported in one module, for `njit` with documented options; no name with an underscore, no fastmath."""
+    """numba is imported in one module, for `njit` and `register_jitable` with documented options; no name with an underscore, no fastmath."""
     documented = {"nogil", "cache", "error_model"}
     users = []
     for path in sources():
@@ -370,7 +370,10 @@ def test_only_what_numba_publishes_is_used_and_sums_are_never_reordered() -> Non
                     continue
             if any(each.partition(".")[0] in ("numba", "llvmlite") for each in modules):
                 users.append((path.name, ast.unparse(node)))
-    assert users == [("jit.py", "from numba import njit")]
+    assert users == [
+        ("jit.py", "from numba import njit"),
+        ("jit.py", "from numba.extending import register_jitable"),
+    ]
     tree = ast.parse((Path(starid.__file__).parent / "kernels" / "jit.py").read_bytes())
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
     options = {word.arg for call in calls if ast.unparse(call.func) == "njit" for word in call.keywords}
