@@ -81,7 +81,7 @@ check: $(VENV)/.developer
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -q -m "not process and not browser and not socketcan" $(addprefix --ignore=,$(call marked,long))
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not process and not browser and not socketcan" $(addprefix --ignore=,$(call marked,long))
 
 # what only tests need is of today; oem and others of the extra `test` need more than the lowest versions
 LOWEST_TOOLS := 'pytest>=8' 'hypothesis>=6.100' msgpack cantools canmatrix space_packet_parser dcf-tools durand spiceypy
