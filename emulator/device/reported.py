@@ -18,6 +18,8 @@ from starhil.emulator.sensor.pipeline.messages import ZERO, Quaternion, Triple, 
 from starhil.protocol.icd.conventions import Conventions
 from starid.arrays import Array
 from starid.attitude import Attitude
+from starid.elementary import atan2, hypot
+from starid.matrices import length
 
 _IDENTITY: Final = Attitude.identity()
 
@@ -62,7 +64,7 @@ class Reported:
         """Rotation vector of the quaternion in the convention of the unit, of at most π."""
         x, y, z, w = self.quaternion_xyzw
         sine = math.sqrt(x * x + y * y + z * z)
-        scale = 2.0 if sine == 0.0 else 2.0 * math.atan2(math.copysign(sine, w), abs(w)) / sine
+        scale = 2.0 if sine == 0.0 else 2.0 * atan2(math.copysign(sine, w), abs(w)) / sine
         return (scale * x, scale * y, scale * z)
 
     @property
@@ -105,8 +107,8 @@ class Reported:
         a, b, c, d = q[3], q[i], q[j], q[k] * sign
         if not proper:
             a, b, c, d = a - c, b + d, c + a, d - b
-        second = 2.0 * math.atan2(math.hypot(c, d), math.hypot(a, b))
-        half_sum, half_difference = math.atan2(b, a), math.atan2(d, c)
+        second = 2.0 * atan2(hypot(c, d), hypot(a, b))
+        half_sum, half_difference = atan2(b, a), atan2(d, c)
         if second < GIMBAL_LOCK_RAD:
             first, third = 2.0 * half_sum, 0.0
         elif second > math.pi - GIMBAL_LOCK_RAD:
@@ -170,8 +172,8 @@ def axes_turns(rows: tuple[tuple[int, int, int], ...]) -> tuple[Array, ...]:
     """Return the rotation vector from sensor axes to reported axes, radians, for the rows of `Conventions.rows`."""
     matrix = np.array(rows, dtype=np.float64)
     *axis, w = Attitude.from_matrix(matrix.T).quaternion_xyzw.tolist()
-    sine = float(np.linalg.norm(axis))
-    return (_read_only(np.array(axis) / sine * 2.0 * math.atan2(sine, w)),) if sine > 0.0 else ()
+    sine = length(np.array(axis))
+    return (_read_only(np.array(axis) / sine * 2.0 * atan2(sine, w)),) if sine > 0.0 else ()
 
 
 def mounting_turns(parameters: Mapping[str, ParameterValue]) -> tuple[Array, ...]:

@@ -35,6 +35,7 @@ from starhil.protocol.icd.values import FieldError, Value
 from starhil.protocol.messages import Flaw, Reply
 from starid.arrays import Array
 from starid.attitude import Attitude
+from starid.elementary import cos, sin
 
 MAX_FAULTS: Final = 32
 """Most faults of telemetry at a time."""
@@ -192,7 +193,7 @@ class Injected:
         one = random.Random(f"{self._seed} {counter}")  # noqa: S311
         z, angle = one.uniform(-1.0, 1.0), one.uniform(-math.pi, math.pi)
         across = math.sqrt(1.0 - z * z)
-        return np.array([across * math.cos(angle), across * math.sin(angle), z])
+        return np.array([across * cos(angle), across * sin(angle), z])
 
     def changed(self, row: Row, data: bytes) -> bytes:
         """Return other data of a row."""

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final
 
 from starhil.protocol.transports.base import TransportError
-from starhil.protocol.transports.paced import READ_SIZE, PacedTransport, termios_as_os_error, write_fd
+from starhil.protocol.transports.paced import PacedTransport, termios_as_os_error, write_fd
 
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _IN_CLOSE: Final = 0x08 | 0x10
@@ -164,7 +164,11 @@ class PtyTransport(PacedTransport):
                 raise TransportError(f"serial: {link} exists and is not a symlink; choose another name")
             temporary = link.with_name(f".{link.name}.{os.getpid()}")
             temporary.symlink_to(path)
-            temporary.replace(link)
+            try:
+                temporary.replace(link)
+            except OSError:  # the link of another user in /tmp, for example
+                temporary.unlink(missing_ok=True)
+                raise
         except OSError as error:
             raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
 
@@ -182,7 +186,7 @@ class PtyTransport(PacedTransport):
             return
         self._drop_unread(self._peers)
         try:
-            data = os.read(self._master, READ_SIZE)
+            data = os.read(self._master, self.read_size)
         except BlockingIOError:
             return
         except OSError as error:

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array, Array32, GreyImage, Indices32, Mask, Records
+from starid.elementary import square
 from starid.errors import StaridError
 from starid.imaging.background import Background, estimate_background
 from starid.imaging.centroid import (
@@ -197,7 +198,7 @@ class Detections:
     @property
     def sigma_px(self) -> Array:
         """Errors (n,) of the position, root mean square of both axes."""
-        return np.asarray(np.sqrt(np.mean(self.xy_sigma_px**2, axis=1)), dtype=np.float64)
+        return np.asarray(np.sqrt(np.mean(square(self.xy_sigma_px), axis=1)), dtype=np.float64)
 
     @property
     def position_errors(self) -> Array:
@@ -463,7 +464,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
     counts, background, settings = scene.counts, scene.background, scene.settings
     peaks, heights = peaks[: 2 * settings.max_stars], heights[: 2 * settings.max_stars]
     per_dn = 0.0 if settings.gain_e_per_dn is None else 1.0 / settings.gain_e_per_dn
-    flux = heights / np.float32(noise_factor(spot_taps(shape.sigma_px)) ** 2)
+    flux = heights / np.float32(square(noise_factor(spot_taps(shape.sigma_px))))
     count = len(peaks)
     windows = np.zeros(count, WINDOW)
     spot = (shape.sigma_px, scene.saturation, background.median_noise)
@@ -542,10 +543,10 @@ def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detecti
         size = (scene.counts.shape[1], scene.counts.shape[0])
         shifts, trails = trail_shifts(shape.flow, middle, size, shape.sigma_px, shape.trail_px)
         middle -= shifts
-        cut = np.where(marks & AT_EDGE, _CUT_TRAIL_ERROR, 0.0) ** 2 * np.sum(trails**2, axis=1)
-        stars["var_x"] += (_TRAIL_ERROR * trails[:, 0]) ** 2 + cut
-        stars["var_y"] += (_TRAIL_ERROR * trails[:, 1]) ** 2 + cut
-        stars["cov_xy"] += _TRAIL_ERROR**2 * trails[:, 0] * trails[:, 1]
+        cut = square(np.where(marks & AT_EDGE, _CUT_TRAIL_ERROR, 0.0)) * np.sum(square(trails), axis=1)
+        stars["var_x"] += square(_TRAIL_ERROR * trails[:, 0]) + cut
+        stars["var_y"] += square(_TRAIL_ERROR * trails[:, 1]) + cut
+        stars["cov_xy"] += square(_TRAIL_ERROR) * trails[:, 0] * trails[:, 1]
     sigmas = np.sqrt(np.column_stack([stars["var_x"], stars["var_y"]]))
     return Detections(
         middle,

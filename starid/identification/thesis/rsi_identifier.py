@@ -16,10 +16,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array, Mask
+from starid.arrays import Array, Mask, elementwise
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
+from starid.elementary import atan2, hypot, log10, power
 from starid.identification.options import RsiOptions
 from starid.identification.single_camera import CheckedDetections, SingleCameraIdentifier
 from starid.identification.solution import FeatureReport, Solution
@@ -34,6 +35,7 @@ from starid.identification.thesis.lsi_identifier import (
 from starid.identification.thesis.parts import Parts
 from starid.identification.thesis.rsi import RsiSettings, region_side
 from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilterSettings, rays
+from starid.matrices import lengths, product
 
 _MIN_MATCHES: Final = 3
 _ENOUGH_MATCHES: Final = 8
@@ -209,7 +211,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         prior = self.preprocess(measured.xy, measured.flux)
         side = prior.side_deg
         if self._last is not None and prior.rotation is not None:
-            centre = Attitude.from_matrix(prior.rotation @ self._last.matrix)
+            centre = Attitude.from_matrix(product(prior.rotation, self._last.matrix))
         else:
             centre = predicted
             if window_px is not None:
@@ -250,7 +252,7 @@ class RsiIdentifier(SingleCameraIdentifier):
             return self._wrong
         new = min(prior.translation_deg / self.lsi.database.grid.step_deg, 1.0)
         odds = self._wrong / max(1.0 - self._wrong, _LEAST_WRONG)
-        odds *= float(errors.ratio[errors.row(answer.error_psi)]) ** new
+        odds *= power(float(errors.ratio[errors.row(answer.error_psi)]), new)
         return max(float(odds / (1.0 + odds)), _LEAST_WRONG)
 
     def _count(self, solution: Solution, report: FeatureReport) -> None:
@@ -275,7 +277,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         ahead = np.isfinite(directions).all(axis=1) & (directions[:, 2] > 0.0)
         usable = usable[ahead]
         positions = np.degrees(directions[ahead, :2] / directions[ahead, 2:3])
-        frame = ObservedFrame(-2.5 * np.log10(flux[usable]), positions)
+        frame = ObservedFrame(-2.5 * elementwise(log10, flux[usable]), positions)
         before, self._before = self._before, frame
         if before is None:
             return unknown
@@ -293,12 +295,12 @@ class RsiIdentifier(SingleCameraIdentifier):
             return unknown
         then, now = _directions(before.positions[pairs[:, 0]]), _directions(frame.positions[pairs[:, 1]])
         rotation = self._parts.motion(then, now)
-        distance_deg = np.degrees(np.linalg.norm(then @ rotation.T - now, axis=1))
+        distance_deg = np.degrees(lengths(product(then, rotation.T) - now))
         return Preprocessed(
             true_stars,
             rotation,
-            math.degrees(math.atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])),
-            math.degrees(math.atan2(math.hypot(rotation[0, 2], rotation[1, 2]), rotation[2, 2])),
+            math.degrees(atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])),
+            math.degrees(atan2(hypot(rotation[0, 2], rotation[1, 2]), rotation[2, 2])),
             region_side(float(distance_deg.mean()), float(distance_deg.std(ddof=1)), self._settings),
         )
 
@@ -353,4 +355,4 @@ class RsiIdentifier(SingleCameraIdentifier):
 def _directions(positions_deg: Array) -> Array:
     """Unit vectors (n, 3) of gnomonic positions in degrees."""
     found = rays(positions_deg)
-    return np.asarray(found / np.linalg.norm(found, axis=1)[:, None], dtype=np.float64)
+    return np.asarray(found / lengths(found)[:, None], dtype=np.float64)

@@ -14,8 +14,9 @@ from scipy.optimize import least_squares
 from starid.attitude import Attitude, random_attitude
 from starid.attitude.wahba import solve_wahba
 from starid.camera import DEFAULT_CAMERA, Camera
-from starid.camera.calibration import NAMES, Calibration, CalibrationFrame, attitude_covariance, calibrate
+from starid.camera.calibration import NAMES, Calibration, CalibrationFrame, calibrate
 from starid.camera.file import load_camera, save_camera
+from starid.camera.position_errors import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.photograph.self_calibration import IMAGE_MODELS, Stars, _best, self_calibrate

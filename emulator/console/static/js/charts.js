@@ -76,7 +76,6 @@ export class Charts {
     document.getElementById("save-csv").addEventListener("click", () => save("starhil.csv", new Blob([this.csv()], { type: "text/csv" })));
     document.getElementById("statistics").addEventListener("toggle", () => this.schedule());
     this.modes.addEventListener("click", (event) => store.scrub(this.from + (event.offsetX / this.modes.clientWidth) * (this.to - this.from)));
-    this.host.addEventListener("keydown", (event) => this.key(event));
   }
 
   setWindow(seconds) {
@@ -91,13 +90,9 @@ export class Charts {
     this.setWindow(WINDOWS[(at + 1) % WINDOWS.length][0]);
   }
 
-  key(event) {
-    const moves = { PageUp: -0.5, PageDown: 0.5 };
-    if (event.key in moves) this.store.scrub((this.store.cursor ?? this.store.now) + moves[event.key] * (this.to - this.from));
-    else if (event.key === "Home") this.store.scrub(-Infinity);
-    else if (event.key === "End") this.store.scrub(null);
-    else return;
-    event.preventDefault();
+  // Move in time, by a share of the span.
+  move(share) {
+    this.store.scrub((this.store.cursor ?? this.store.now) + share * (this.to - this.from));
   }
 
   schedule() {
