@@ -1,6 +1,7 @@
 // The sensor image with matched, unmatched and missing stars.
 
-import { drawRemoved } from "./features.js";
+import { toSensor } from "./directions.js";
+import { drawRegion, drawRemoved } from "./features.js";
 import { fixed, press, save, say, setText } from "./format.js";
 import { colour, onTheme, pen } from "./theme.js";
 
@@ -223,6 +224,7 @@ export class Sky {
     if (this.layers.bodies) this.drawBodies(marks, head);
     this.drawStars(marks, head);
     drawRemoved(marks, head, (x, y) => this.place(x, y));
+    drawRegion(marks, head, "on-sky-rate", (points) => this.skyLine(marks, head, points));
     if (this.layers.bodies) this.drawRate(marks, head);
     this.point();
   }
@@ -353,6 +355,16 @@ export class Sky {
     context.fillStyle = ink;
     context.fillText(text, x, y);
     context.lineWidth = 1.4 * pen();
+  }
+
+  // A line through right ascensions and declinations in front of the camera, whose distortion is left out.
+  skyLine(context, head, points) {
+    const { focal_px: focal, centre_px: centre } = this.store.hello.camera;
+    const seen = points.map((point) => toSensor(point, head.true_q));
+    if (!focal || !centre || seen.some(([, , z]) => z < 0.1)) return;
+    context.beginPath();
+    for (const [x, y, z] of seen) context.lineTo(...this.place(centre[0] + (focal[0] * x) / z, centre[1] + (focal[1] * y) / z));
+    context.stroke();
   }
 
   // Motion of the boresight: with the body rate ω it is ω × z = (ω_y, −ω_x).
