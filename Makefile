@@ -1,7 +1,7 @@
 # make demo        set up and run the product end to end; results in out/demo
 # make test        set up and run all tests (those on a real vcan0 in a guest); the last lines say what ran, and why tests were skipped
 # make check       for whoever edits, a minute and a half: ruff, contracts of imports, and tests without processes and long computations
-# make lowest      the tests of LOWEST with the lowest versions of dependencies that pyproject.toml admits
+# make lowest      the tests marked `lowest` with the lowest versions of dependencies that pyproject.toml admits
 # make versions    the same tests with the newest dependencies on VERSIONS of Python, on the Debians that have them (as root, on Debian)
 # make arm64       the same bytes as here on an emulated arm64, and on the processor of an older server (as root, on Debian; an hour)
 # make lint        ruff, mypy --strict and the contracts of imports
@@ -74,45 +74,26 @@ lane-vcan0:
 lane-%:
 	@env -u MAKEFLAGS $(PRIORITY) $(BIN)/python -m pytest -m "not socketcan" --junit-xml=$(REPORTS)/$*.xml $(TESTS)
 
-# of `check`, beside the tests that start processes: what computes for seconds, or waits for the clock or a peer
-LONG := $(addprefix tests/,process fuzzing conformance test_docs.py test_public_names.py) \
-	$(addprefix tests/hil_tests/,endurance timing rig client/test_client.py) \
-	$(addprefix tests/emulator/,benchmarks console launch test_connections.py cli/test_render.py device/test_extreme_values.py \
-		profile/test_real_lens.py sensor/pipeline/test_stated_uncertainty.py) \
-	$(addprefix tests/protocol/,transports export test_hostile_text.py test_fuzz.py unit/test_unit_fuzz.py) \
-	$(wildcard $(addprefix tests/protocol/canopen/test_,conformance*.py dissection.py durand.py library_master.py sdo_stateful.py slave_fuzz.py)) \
-	$(addprefix tests/starid/,kernels lab cli imaging photograph camera/test_calibration.py catalog/test_aberration.py) \
-	$(addprefix tests/starid/identification/,thesis geometric/test_identifier_fields.py geometric/test_index_file.py)
+# files with a marker; pytest's own selection would import all others, too
+marked = $(shell grep -rl --include='test_*.py' 'pytest\.mark\.$(1)\b' tests)
+# beside the tests that start processes, without those marked as long: they compute for seconds, or wait for the clock or a peer
 check: $(VENV)/.developer
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -q -m "not process and not browser and not socketcan" $(LONG:%=--ignore=%)
+	$(BIN)/python -m pytest -q -m "not process and not browser and not socketcan" $(addprefix --ignore=,$(call marked,long))
 
 # what only tests need is of today; oem and others of the extra `test` need more than the lowest versions
 LOWEST_TOOLS := 'pytest>=8' 'hypothesis>=6.100' msgpack cantools canmatrix space_packet_parser dcf-tools durand spiceypy
-# of each dependency the tests of the modules that call it: another version can change only what these do
-LOWEST := $(addprefix tests/, \
-	protocol/unit/test_reader.py emulator/profile/test_profile.py \
-	protocol/serial/test_checks.py \
-	$(addprefix protocol/canopen/,test_pdo.py test_emergency.py test_eds.py test_device_dictionary.py test_library_master.py) \
-	protocol/transports/test_serial.py protocol/transports/test_can_buses.py \
-	protocol/export/test_export.py \
-	emulator/cli/test_app.py emulator/cli/test_option_groups.py emulator/cli/test_completion.py emulator/console/test_server.py \
-	emulator/benchmarks/test_ecss_errors.py starid/identification/thesis/test_rsi.py starid/identification/thesis/test_reference.py \
-	starid/imaging/test_image_io.py starid/imaging/test_dark_frame.py emulator/sensor/pipeline/test_preview.py emulator/sensor/sky \
-	emulator/truth/test_orbit.py emulator/benchmarks/test_campaign.py starid/lab/leaderboard/test_report.py \
-	starid/catalog/test_catalog.py starid/camera/test_camera.py starid/imaging/test_detection.py emulator/sensor/test_renderer.py \
-	starid/identification/geometric/test_identifier.py starid/kernels)
-# in this order: pydantic; xxhash; construct and canopen; pyserial and python-can; jinja2; typer, rich and aiohttp; SciPy and scikit-learn;
-# OpenCV and pyerfa; sgp4, joblib and matplotlib; the catalogue, numpy and numba, with kernels of each package
+# the files marked with a dependency whose other versions can change what they test; others may need packages that are not installed there
+LOWEST = $(call marked,lowest)
 out/lowest/.installed: pyproject.toml tools/lowest_versions.py
 	$(PYTHON) -m venv out/lowest
 	$(PYTHON) tools/lowest_versions.py >out/lowest/constraints.txt
 	out/lowest/bin/pip install --quiet --no-compile --constraint out/lowest/constraints.txt --editable '.[lab]' $(LOWEST_TOOLS)
 	@touch $@
 
-RUN_LOWEST := -m pytest -q -m "not process and not browser and not socketcan" \
+RUN_LOWEST = -m pytest -q -m "not process and not browser and not socketcan" \
 	-k "not fuzz and not stateful and not mutant and not durand" $(LOWEST)
 
 lowest: out/lowest/.installed

@@ -58,18 +58,21 @@ def put_readme_first(_app: Sphinx, page: str, source: list[str]) -> None:
         source[0] = f"{text}\n{source[0]}"
 
 
-def copy_interfaces(_app: Sphinx) -> None:
-    """Put the interface definitions, which stand beside their units, among the pages."""
-    (ROOT / "docs/icd").mkdir(exist_ok=True)
-    for file in (ROOT / "configs/units").glob("*/icd.md"):
-        (ROOT / "docs/icd" / f"{file.parent.name}.md").write_bytes(file.read_bytes())
+def write_interfaces(_app: Sphinx) -> None:
+    """Put the interface definitions of the units among the pages."""
+    from starhil.protocol.export import export
+    from starhil.protocol.files.bundled import bundled_units
+    from starhil.protocol.unit import load_unit
+
+    for name in bundled_units():
+        (ROOT / "docs/icd" / f"{name}.md").write_text(export(load_unit(name), "markdown"), encoding="utf-8")
 
 
 def put_tables(_app: Sphinx, _page: str, source: list[str]) -> None:
-    """Put the reference tables in their places, and let links to interface definitions lead to the copies."""
+    """Put the reference tables in their places, and let links to the files of a unit lead to its interface definition."""
     from starhil.emulator.cli.reference import with_built_tables
 
-    text = re.sub(r"\]\((?:\.\./)?configs/units/([\w-]+)/icd\.md", r"](icd/\1.md", source[0])
+    text = re.sub(r"\]\(\.\./configs/units/([\w-]+)\)", r"](icd/\1.md)", source[0])
     source[0] = with_built_tables(text)
 
 
@@ -100,6 +103,6 @@ def setup(app: Sphinx) -> None:
     """Connect what this file adds."""
     app.connect("autodoc-process-signature", shorten_array_types)
     app.connect("autodoc-process-docstring", keep_whole_sentences, priority=600)
-    app.connect("builder-inited", copy_interfaces)
+    app.connect("builder-inited", write_interfaces)
     app.connect("source-read", put_readme_first)
     app.connect("source-read", put_tables)

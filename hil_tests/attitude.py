@@ -7,12 +7,15 @@ The bench has its own quaternion algebra so that it shares no numerics with the 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from starhil.hil_tests.errors import BenchError
+from starhil.protocol.icd.codec import Field, Row
 from starhil.protocol.icd.conventions import Conventions
+from starhil.protocol.icd.units_of_measure import factor
+from starhil.protocol.icd.values import Value
 
 ARCSEC_PER_RAD: Final = math.degrees(1.0) * 3600.0
 _NORM_TOLERANCE: Final = 0.02
@@ -90,12 +93,64 @@ def from_rotation_vector(vector: Sequence[float]) -> Quaternion:
     return Quaternion(x, y, z, math.cos(0.5 * angle))
 
 
+def from_gibbs_vector(vector: Sequence[float]) -> Quaternion:
+    """Return the rotation whose Gibbs or Rodrigues vector, tan(φ/2) along its axis, is given."""
+    scalar = 1.0 / math.hypot(1.0, *vector)
+    x, y, z = (scalar * part for part in vector)
+    return Quaternion(x, y, z, scalar)
+
+
+def from_modified_rodrigues(parameters: Sequence[float]) -> Quaternion:
+    """Return the rotation whose modified Rodrigues parameters, tan(φ/4) along its axis, are given."""
+    square = math.fsum(part * part for part in parameters)
+    x, y, z = (2.0 * part / (1.0 + square) for part in parameters)
+    return Quaternion(x, y, z, (1.0 - square) / (1.0 + square))
+
+
 def rotation_vector(q: Sequence[float]) -> Vector:
     """Return the direction of the axis of a rotation times its angle, at most half a turn, rad."""
     x, y, z, w = q
     sine = math.copysign(math.hypot(x, y, z), w)
     scale = 2.0 * math.atan2(abs(sine), abs(w)) / sine if sine else 2.0
     return scale * x, scale * y, scale * z
+
+
+_FORMS: Final[tuple[tuple[str, str, Callable[[Sequence[float]], Quaternion]], ...]] = (
+    ("", "xyzw", unit),
+    ("gibbs_", "xyz", from_gibbs_vector),
+    ("mrp_", "xyz", from_modified_rodrigues),
+    ("rotation_", "xyz", from_rotation_vector),
+    ("", "xyz", lambda parts: from_vector_part(*parts)),
+)
+"""Prefix and components of the quantities that together are an attitude, and the function of their values."""
+
+
+def attitude_fields(row: Row) -> tuple[list[Field], Callable[[Sequence[float]], Quaternion]] | None:
+    """Return the fields in which a row reports an attitude, and the function of their values; None if there are none."""
+    by_quantity = {field.value: field for field in reversed([*row.named_fields.values()])}
+    for prefix, letters, rotation in _FORMS:
+        names = [f"attitude.{prefix}{letter}" for letter in letters]
+        if by_quantity.keys() >= set(names):
+            return [by_quantity[name] for name in names], rotation
+    return None
+
+
+def attitude_in(row: Row, values: Mapping[str, Value]) -> Quaternion:
+    """Return the attitude in a row as the unit reports it: as a quaternion, Gibbs vector, MRPs or rotation vector.
+
+    Raises BenchError: the row has no such attitude, it is flagged invalid, or it is no attitude.
+    """
+    found = attitude_fields(row)
+    if found is None:
+        raise BenchError(f"row '{row.name}' reports no quaternion, Gibbs vector, MRPs or rotation vector")
+    if any(
+        values.get(field.name) is False
+        for field in row.named_fields.values()
+        if field.value == "attitude.valid"
+    ):
+        raise BenchError(f"the attitude is not valid (reason {values.get('reason', '?')!s})")
+    fields, rotation = found
+    return rotation([float(values[field.name]) * (factor(field.unit, "rad") or 1.0) for field in fields])
 
 
 def as_reported(attitude: Quaternion, conventions: Conventions) -> Quaternion:

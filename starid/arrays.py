@@ -33,10 +33,20 @@ def record_type(form: type) -> np.dtype[np.void]:
 
 
 def elementwise(function: Callable[..., float], *arrays: ArrayLike) -> Array:
-    """Return a function of `math` for each element of arrays of equal shape.
-
-    The last bit of numpy's own ``exp``, ``arctan2`` or powers depends on the vector instructions of the processor.
-    """
+    """Return a function of `starid.elementary` for each element of arrays of equal shape."""
     tables = [np.asarray(each, np.float64) for each in arrays]
     values = map(function, *(each.ravel().tolist() for each in tables))
     return np.fromiter(values, np.float64, tables[0].size).reshape(tables[0].shape)
+
+
+def interpolated(values: ArrayLike, nodes: Array, heights: Array) -> Array:
+    """Interpolate linearly, as `numpy.interp` does, whose last bit depends on the processor."""
+    at = np.asarray(values, np.float64)
+    row = np.clip(np.searchsorted(nodes, at, side="right") - 1, 0, len(nodes) - 2)
+    part = np.clip((at - nodes[row]) / (nodes[row + 1] - nodes[row]), 0.0, 1.0)
+    return np.asarray(heights[row] + part * (heights[row + 1] - heights[row]), np.float64)
+
+
+def on_grid(values: ArrayLike, step: float) -> Array:
+    """Round to multiples of a power of two, which hides that libraries differ in the last digits on different machines."""
+    return np.asarray(np.rint(np.asarray(values, np.float64) / step) * step, np.float64)

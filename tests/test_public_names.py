@@ -7,7 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import starhil
+
+pytestmark = pytest.mark.long
 
 USER_FILE = """
 import math

@@ -15,6 +15,7 @@ from starhil.emulator.profile import load_profile
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.session.script import load_script
+from starhil.protocol.export import export
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
 from tests.waiting import PATIENCE_S
@@ -66,6 +67,15 @@ def test_starhil_docs_prints_the_tables_that_the_files_lack(page, entries):
     assert (status, said) == (0, "")
     assert [entry for entry in entries if entry not in printed] == []
     assert "<!-- built" not in printed
+
+
+@pytest.mark.parametrize(
+    ("words", "unit"),
+    [(["icd"], "cubestar"), (["icd", "st16"], "st16"), (["docs/icd/sagitta.md"], "sagitta")],
+)
+def test_starhil_docs_prints_the_interface_definition_of_a_unit(words, unit):
+    assert run_command_line("docs", *words) == (0, export(load_unit(unit), "markdown"), "")
+    assert f"icd/{unit}" in run_command_line("docs")[1].split()
 
 
 @pytest.mark.parametrize(

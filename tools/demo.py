@@ -95,10 +95,13 @@ def run_features(out: Path) -> str | None:
         return None
     images = read_csv(folder / "truth.csv")
     refined = images["refined"] == 1
-    region = np.count_nonzero(refined & (images["search"] == "rsi"))
+    region, triggered = (
+        np.count_nonzero(refined & rows) for rows in (images["search"] == "rsi", images["triggered"] == 1)
+    )
     return (
         f'run.algorithm = "rsi": features found, and stars verified, {np.count_nonzero(refined)} of {len(images)} images, '
-        f"{region} of them in the region of search, with the lens covered in between"
+        f"with the lens covered in between; {region + triggered} were searched first where the motion of the stars says, "
+        f"and {region} were found there"
     )
 
 

@@ -41,7 +41,8 @@ INSTRUMENTED = (
     "starhil.hil_tests.client.images", "starhil.hil_tests.client.raw_traffic", "starhil.hil_tests.rig.truth_log",
     "starhil.hil_tests.rig.emulator_process", "starhil.emulator.control", "starhil.emulator.console",
     "starhil.emulator.device", "starhil.emulator.truth", "starhil.emulator.profile",
-    "starhil.emulator.launch.replay", "starhil.emulator.launch.replay_differences", "starhil.emulator.cli.endurance", "starhil.emulator.run.recorder",
+    "starhil.emulator.launch.replay", "starhil.emulator.launch.replay_differences", "starhil.emulator.cli.endurance",
+    "starhil.emulator.run.recorder",
     "starhil.emulator.truth.json_lines", "starhil.emulator.profile.toml_file", "starid.storage.files",
     "starid.imaging.image_io", "starid.camera.file", "starid.catalog.hipparcos", "starid.identification.thesis.database_file",
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Write the generated tables of the pages in docs/, and the interface definition of each bundled unit beside its files.
+"""Write the generated tables of the pages in docs/, and the interface definition of the default unit among them.
 
 Run `python tools/make_reference.py`. tests/test_reference.py and tests/test_docs.py compare the files with the code.
 """
@@ -11,7 +11,7 @@ from typing import Final
 
 from starhil.emulator.cli.reference import BLOCK, with_tables
 from starhil.protocol.export import export
-from starhil.protocol.files.bundled import bundled_units
+from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starhil.protocol.unit import load_unit
 
 ROOT: Final = Path(__file__).resolve().parent.parent
@@ -29,8 +29,7 @@ def pages() -> list[Path]:
 def main() -> None:
     """Write what has changed."""
     texts = {path: with_tables(path.read_text(encoding="utf-8")) for path in pages()}
-    for name in bundled_units():
-        texts[ROOT / "configs" / "units" / name / "icd.md"] = export(load_unit(name), "markdown")
+    texts[ROOT / "docs" / "icd" / f"{DEFAULT_UNIT}.md"] = export(load_unit(), "markdown")
     for path, text in texts.items():
         if not path.exists() or path.read_text(encoding="utf-8") != text:
             path.write_text(text, encoding="utf-8")

@@ -64,7 +64,10 @@ TESTS_S = 30.0
 UNJUDGED = 70
 """Exit status of a process that failed before its tests ran."""
 MEMORY = 6_000_000_000
-_SWAPS = "Lt LtE, Gt GtE, Eq NotEq, Is IsNot, In NotIn, Add Sub, LShift RShift, BitAnd BitOr, And Or, Mult Add, Div Mult, FloorDiv Mult, Mod Mult, BitXor BitOr"
+_SWAPS = (
+    "Lt LtE, Gt GtE, Eq NotEq, Is IsNot, In NotIn, Add Sub, LShift RShift, BitAnd BitOr, And Or, Mult Add, Div Mult, "
+    "FloorDiv Mult, Mod Mult, BitXor BitOr"
+)
 SWAPS: dict[type, type] = {}
 for _pair in _SWAPS.split(", "):
     _one, _other = (getattr(ast, name) for name in _pair.split())

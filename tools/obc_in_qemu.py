@@ -3,9 +3,10 @@
 python tools/obc_in_qemu.py [--link pty|tcp|theirs] [--clock real|scaled:FACTOR] [--icount SHIFT] [--out DIR]
 
 The flight computer reaches the star tracker over the emulator's pseudo-terminal (`pty`), over TCP (`tcp`), or over a
-pseudo-terminal that QEMU opens and the emulator connects to (`theirs`, as with Renode and Zephyr). Its attitudes are compared
-with the truth log. With `--icount`, an instruction of the flight computer takes 2^SHIFT ns of its time, which then does not keep
-pace with that of the star tracker; without, both run in real time. Exit status: 0 if it has read 25 valid attitudes and all agree with the truth.
+pseudo-terminal that QEMU opens and the emulator connects to (`theirs`, as with Renode and Zephyr). Its attitudes are
+compared with the truth log. With `--icount`, an instruction of the flight computer takes 2^SHIFT ns of its time, which
+then does not keep pace with that of the star tracker; without, both run in real time. Exit status: 0 if it has read 25
+valid attitudes and all agree with the truth.
 """
 
 from __future__ import annotations

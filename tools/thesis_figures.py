@@ -72,6 +72,7 @@ def figures(samples: list[dict[str, str]], truth: dict[str, dict[str, str]]) -> 
         "false stars removed, %": 100.0 * caught / false if kept and false else np.nan,
         "motion: rotation, median error, °": np.median(np.abs(turns)) if turns else np.nan,
         "motion: translation, median error, °": np.median(np.abs(shifts)) if shifts else np.nan,
+        "answer from the region, %": 100.0 * np.mean([int(sent["region_searched"]) for _, sent in images]),
         "whole database searched after the region, %": 100.0
         * np.mean([int(sent["triggered"]) for _, sent in images]),
         f"ε_ψ > {TAU:g}, %": 100.0 * np.mean([float(sent["error_psi"]) > TAU for _, sent in images]),

@@ -199,39 +199,40 @@ class _Tally:
         self._scene = scene
         self._part = part
         self._last: list[tuple[int, Attitude]] = []
-        self._valid: list[bool] = []
-        self._errors: list[np.ndarray] = []
+        self._errors: list[tuple[float, float]] = []
+        """Of each image across and about the boresight, degrees; infinite without an attitude."""
         self._normalised: list[np.ndarray] = []
         self._stated: list[float] = []
         self._ms: list[float] = []
         self._in_region = self._triggers = 0
         self._kept = np.zeros((2, 2), dtype=np.int64)
         """Detections by whether they are false stars, and whether the filter kept them."""
-        self._bytes = 0
+        self._identifier: Any = None
 
     def add(self, image: _Image) -> None:
         """Identify the detections of an image."""
         pipeline, place = self._device.pipeline, image.number % self._scene.length
-        identifier: Any = pipeline.identifier(image.request)
-        self._bytes = int(identifier.database_bytes)
+        if self._identifier is None:
+            intact: Any = pipeline.identifier(image.request)
+            self._identifier = without(self._part, intact) if self._part else intact
         if place == 0:
             self._last = []
-            if hasattr(identifier, "reset"):
-                identifier.reset()
+            if hasattr(self._identifier, "reset"):
+                self._identifier.reset()
         expected = self._predicted(image.number) if self._scene.predicted else None
         request = replace(image.request, predicted=expected)
-        with without(self._part):
-            begin = time.thread_time()
-            solution = pipeline.solution(image.found, request)
-            elapsed_ms = 1e3 * (time.thread_time() - begin)
+        begin = time.thread_time()
+        solution = pipeline.solution(image.found, request, self._identifier)
+        elapsed_ms = 1e3 * (time.thread_time() - begin)
         if solution.valid:
             self._last = [*self._last[-1:], (image.number, solution.attitude)]
         if self._scene.second and place == 0:
             return
         self._ms.append(elapsed_ms)
-        self._valid.append(solution.valid)
         if solution.valid:
             self._judge(solution, image.request.truth.attitude)
+        else:
+            self._errors.append((math.inf, math.inf))
         if solution.features is not None:
             self._in_region += solution.valid and solution.features.search == "rsi"
             self._triggers += solution.features.triggered
@@ -250,31 +251,34 @@ class _Tally:
     def _judge(self, solution: Solution, truth: Attitude) -> None:
         error = solution.attitude.error_to(truth)
         vector = error.rotation_vector_rad
-        self._errors.append(np.array([error.cross_boresight_arcsec, error.roll_arcsec]) / 3600.0)
+        self._errors.append((error.cross_boresight_arcsec / 3600.0, error.roll_arcsec / 3600.0))
         self._normalised.append(vector**2 / np.diag(solution.covariance))
         self._stated.append(solution.cross_boresight_sigma_arcsec / 3600.0)
 
-    def _standard_error(self) -> float | None:
-        """Standard error of the share of valid attitudes, from independent sequences; None if there is only one."""
+    def _share(self, name: str, images: Mask) -> dict[str, float | None]:
+        """Share of images, and its standard error from independent sequences, None if there is only one; in percent."""
         length = 1 if self._scene.second else self._scene.length
-        shares = [np.mean(self._valid[at : at + length]) for at in range(0, len(self._valid), length)]
-        return float(np.std(shares, ddof=1) / math.sqrt(len(shares))) if len(shares) > 1 else None
+        shares = [np.mean(images[at : at + length]) for at in range(0, images.size, length)]
+        error = float(np.std(shares, ddof=1) / math.sqrt(len(shares))) if len(shares) > 1 else None
+        return {
+            f"{name}_pct": 100.0 * float(np.mean(images)),
+            f"{name}_error_pct": None if error is None else 100.0 * error,
+        }
 
     def figures(self, name: str) -> dict[str, Any]:
-        """Figures of the condition: errors of valid attitudes in degrees, times of the processor."""
-        errors = np.array(self._errors).reshape(-1, 2)
-        limit = FEATURES_WRONG_DEG if name == "thesis" else WRONG_DEG
-        across = errors[:, 0] if name == "thesis" else errors.max(axis=1, initial=0.0)
-        valid, frames = len(errors), len(self._valid)
+        """Figures of the condition: shares of all images, errors of valid attitudes in degrees, times of the processor."""
+        each = np.array(self._errors)
+        is_valid = np.isfinite(each[:, 0])
+        right = each[:, 0] <= FEATURES_WRONG_DEG if name == "thesis" else each.max(axis=1) <= WRONG_DEG
+        errors, valid = each[is_valid], int(np.count_nonzero(is_valid))
         true, false = self._kept
-        standard_error = self._standard_error()
         return {
-            "frames": frames,
+            "frames": len(each),
             "valid": valid,
-            "valid_pct": 100.0 * valid / frames,
-            "standard_error_pct": None if standard_error is None else 100.0 * standard_error,
-            "wrong": int(np.count_nonzero(across > limit)),
-            "within_pct": 100.0 * float(np.mean(errors[:, 0] <= NEAR_DEG)) if valid else None,
+            **self._share("valid", is_valid),
+            "wrong": int(np.count_nonzero(is_valid & ~right)),
+            **self._share("right", right),
+            **self._share("within", each[:, 0] <= NEAR_DEG),
             "across_deg": float(np.median(errors[:, 0])) if valid else None,
             "about_deg": float(np.median(errors[:, 1])) if valid else None,
             "stated_deg": float(np.median(self._stated)) if valid else None,
@@ -285,7 +289,7 @@ class _Tally:
             "false_kept_pct": 100.0 * false[1] / false.sum() if false.sum() else None,
             "median_ms": float(np.median(self._ms)),
             "p99_ms": float(np.percentile(self._ms, 99)),
-            "kilobytes": self._bytes / 1000.0,
+            "kilobytes": self._identifier.database_bytes / 1000.0,
         }
 
 

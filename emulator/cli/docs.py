@@ -12,9 +12,13 @@ import typer
 from starhil.emulator.cli.output import print_text
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.errors import remedy
+from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled_units
 
 _FOLDER: Final = Path(__file__).resolve().parents[2] / "docs"
 """Folder of the pages in the installation or checkout."""
+
+_INTERFACES: Final = "icd/"
+"""Beginning of the names of interface definitions."""
 
 _HEADING: Final = "# "
 """Beginning of a page; the others are directives for the web site."""
@@ -25,12 +29,25 @@ _DIRECTIVES: Final = re.compile(r"^```\{eval-rst\}\n(.*?)^```\n", re.MULTILINE |
 
 
 def pages() -> dict[str, str]:
-    """Return the pages in Markdown, by path, those of the folder itself first; those of the API are `api/NAME`."""
+    """Return the pages in Markdown, by path, those of the folder itself first; those of the API are `api/NAME`.
+
+    The interface definition of a unit, `icd/NAME`, has only its heading here: `interface` makes its text.
+    """
     files = sorted(_FOLDER.rglob("*.md"), key=lambda file: (len(file.parts), file))
     texts = {
         str(file.relative_to(_FOLDER).with_suffix("")): file.read_text(encoding="utf-8") for file in files
     }
-    return {name: text for name, text in texts.items() if text.startswith(_HEADING)}
+    interfaces = {
+        f"{_INTERFACES}{name}": f"{_HEADING}Interface definition of `{name}`" for name in bundled_units()
+    }
+    return {name: text for name, text in texts.items() if text.startswith(_HEADING)} | interfaces
+
+
+def _interface(unit: str) -> str:
+    from starhil.protocol.export import export
+    from starhil.protocol.unit import load_unit
+
+    return export(load_unit(unit), "markdown")
 
 
 def _with_docstrings(directives: re.Match[str]) -> str:
@@ -52,19 +69,27 @@ def names(incomplete: str) -> list[str]:
 
 def command(
     page: Annotated[
-        str | None,
+        list[str] | None,
         typer.Argument(help="Name of a page; without it, the pages are listed.", autocompletion=names),
     ] = None,
 ) -> None:
-    """Print a page of the documentation, in Markdown, or list the pages."""
+    """Print a page of the documentation, in Markdown, or list the pages.
+
+    `starhil docs icd NAME` prints the interface definition of a unit.
+    """
     texts = pages()
-    if page is None:
+    if not page:
         for name, text in texts.items():
             print(f"{name:<18}  {text.splitlines()[0].removeprefix(_HEADING)}")
         return
-    name = page.removeprefix("docs/").partition("#")[0].removesuffix(".md")
+    wanted = "/".join(page)
+    name = wanted.removeprefix("docs/").partition("#")[0].removesuffix(".md")
+    name = f"{_INTERFACES}{DEFAULT_UNIT}" if f"{name}/" == _INTERFACES else name
     if name not in texts:
-        raise EmulatorError(f"page {page!r}: not found{remedy(name, texts)}")
+        raise EmulatorError(f"page {wanted!r}: not found{remedy(name, texts)}")
+    if name.startswith(_INTERFACES):
+        print_text(_interface(name.removeprefix(_INTERFACES)))
+        return
     from starhil.emulator.cli.reference import with_built_tables
 
     print_text(with_built_tables(_DIRECTIVES.sub(_with_docstrings, texts[name])))

@@ -267,9 +267,15 @@ def read_life(path: Path) -> Any:
         content = json.loads(read_user_text(path))
         links, steps = tuple(content["links"]), tuple(content["steps"])
         rendered = content.get("rendered", False) is True
-        return Life(str(content["unit"]), content["seed"], links, content["profile"], steps, rendered)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        foreign = content["profile"].keys() - {"parameters", "run"}
+        life = Life(str(content["unit"]), content["seed"], links, content["profile"], steps, rendered)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise EmulatorError(f"{path}: not a life of `starhil endurance`: {error}") from None
+    if foreign:
+        raise EmulatorError(
+            f"{path}: not a life of `starhil endurance`: profile.{min(foreign)}: no life has it"
+        )
+    return life
 
 
 # --- figures ---

@@ -53,6 +53,12 @@ def export(
         ),
     ] = None,
     unit: Unit = DEFAULT_UNIT,
+    rows: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME,…", help="For c: code for these telecommands and telemetry rows; default: all."
+        ),
+    ] = None,
 ) -> None:
     """Export the interface definition in another format.
 
@@ -63,10 +69,13 @@ def export(
     from starhil.protocol.unit import load_unit
 
     definition, name = load_unit(unit), format_.value
+    if rows is not None and format_ is not Format.C:
+        raise EmulatorError(f"icd export {name}: --rows is for c only")
     if name in formats.FOLDER_FORMATS:
         if output is None or output.is_file():
             raise EmulatorError(f"icd export {name}: writes several files; name a folder with -o")
-        for path, text in formats.export_folder(definition, name).items():
+        chosen = {} if rows is None else {"rows": [row.strip() for row in rows.split(",")]}
+        for path, text in formats.export_folder(definition, name, **chosen).items():
             _write(output / path, text)
         return
     text = formats.export(definition, name)

@@ -9,7 +9,7 @@ import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_args, get_type_hints
 
 import typer
 
@@ -34,6 +34,12 @@ from starid.cli.output import output_help, prepare_output
 if TYPE_CHECKING:
     from starhil.emulator.launch import Emulator, RunOptions
     from starhil.emulator.profile import Profile
+
+
+LINKS_PANEL: Final = "Other links, several heads"
+TIME_PANEL: Final = "Time, seed and state"
+CONTROL_PANEL: Final = "Control channel, tokens, files and log"
+"""Groups of the options in `--help`, after those that most runs need."""
 
 
 @dataclass(frozen=True)
@@ -76,41 +82,50 @@ class DeviceOptions:
         str | None,
         Key("links.serial.dialect"),
         typer.Option(
+            rich_help_panel=LINKS_PANEL,
             help="Format of serial replies: a for OBC software written for the CubeComputer (replies begin with the "
             "row ID), b for a stand-alone node (no ID), c for generation 2. With the wrong dialect, values are shifted by "
-            "one byte. Default: the profile's (b)."
+            "one byte. Default: the profile's (b).",
         ),
     ] = None
     can: Annotated[
         str | None,
         Key("links.can.channel"),
         typer.Option(
-            help="CAN link: auto (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a channel, or off. Default: the profile's (auto)."
+            help="CAN link: auto (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a "
+            "channel, or off. Default: the profile's (auto)."
         ),
     ] = None
     canopen: Annotated[
         int | None,
         Key("links.canopen.node"),
         typer.Option(
-            min=0, max=127, help="Also run a CANopen node with this ID; 0: off. Default: the profile's (0)."
+            rich_help_panel=LINKS_PANEL,
+            min=0,
+            max=127,
+            help="Also run a CANopen node with this ID; 0: off. Default: the profile's (0).",
         ),
     ] = None
     seed: Annotated[
-        int | None, Key("run.seed"), typer.Option(help="Random seed. Default: the profile's (1).")
+        int | None,
+        Key("run.seed"),
+        typer.Option(rich_help_panel=TIME_PANEL, help="Random seed. Default: the profile's (1)."),
     ] = None
     clock: Annotated[
         str | None,
         Key("run.clock"),
         typer.Option(
+            rich_help_panel=TIME_PANEL,
             help="Simulation clock: real, scaled:FACTOR, or stepped (advances only on request, for repeatable runs). "
-            "Default: the profile's (real)."
+            "Default: the profile's (real).",
         ),
     ] = None
     state_dir: Annotated[
         Path | None,
         Key("run.state_dir", _state_dir),
         typer.Option(
-            help="Folder for state that survives restarts, such as saved parameters. Default: no state is kept."
+            rich_help_panel=TIME_PANEL,
+            help="Folder for state that survives restarts, such as saved parameters. Default: no state is kept.",
         ),
     ] = None
     symlink: Annotated[
@@ -141,14 +156,17 @@ class AroundOptions:
     control: Annotated[
         str,
         typer.Option(
+            rich_help_panel=CONTROL_PANEL,
             help="Control channel: off, auto (a Unix socket that only this user can open), unix:/PATH, "
-            "or HOST:PORT (open to all local users)."
+            "or HOST:PORT (open to all local users).",
         ),
     ] = "off"
     control_token: Annotated[
         str | None,
         typer.Option(
-            envvar="STARHIL_CONTROL_TOKEN", help="Token required in each request on the control channel."
+            rich_help_panel=CONTROL_PANEL,
+            envvar="STARHIL_CONTROL_TOKEN",
+            help="Token required in each request on the control channel.",
         ),
     ] = None
     truth_log: Annotated[
@@ -156,7 +174,10 @@ class AroundOptions:
         typer.Option(help=output_help("CSV file of true and measured attitudes, one row per frame.")),
     ] = None
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Overwrite an existing truth log or recording.")
+        bool,
+        typer.Option(
+            "--overwrite", rich_help_panel=CONTROL_PANEL, help="Overwrite an existing truth log or recording."
+        ),
     ] = False
     scenario: Annotated[
         str,
@@ -176,6 +197,7 @@ class AroundOptions:
     view_token: Annotated[
         str | None,
         typer.Option(
+            rich_help_panel=CONTROL_PANEL,
             envvar="STARHIL_VIEW_TOKEN",
             help="Token of a second address of the console (`view_only` on the ready line), whose pages can look but not "
             "command. It is the same in the next run, so that such pages reconnect.",
@@ -184,6 +206,7 @@ class AroundOptions:
     command_token: Annotated[
         str | None,
         typer.Option(
+            rich_help_panel=CONTROL_PANEL,
             envvar="STARHIL_COMMAND_TOKEN",
             help="Token of the console's address (`view`), the same in the next run, so that its pages reconnect; default: "
             "a random one.",
@@ -242,6 +265,7 @@ def command(
     head: Annotated[
         list[str] | None,
         typer.Option(
+            rich_help_panel=LINKS_PANEL,
             help="Emulate several heads: give --head PROFILE for each, instead of PROFILE. All heads share one clock and the "
             "first head's truth; each has its own mount.",
             autocompletion=names_of("profile"),
@@ -250,7 +274,12 @@ def command(
     *,
     device: DeviceOptions,
     around: AroundOptions,
-    log: Annotated[str, typer.Option(help="Log level on stderr: debug, info, warning or error.")] = "warning",
+    log: Annotated[
+        str,
+        typer.Option(
+            rich_help_panel=CONTROL_PANEL, help="Log level on stderr: debug, info, warning or error."
+        ),
+    ] = "warning",
     _list: Annotated[bool, list_option("profile", "scenario")] = False,
 ) -> int:
     """Run the emulator until SIGINT, SIGTERM or SIGHUP.
@@ -266,6 +295,7 @@ def command(
     from starhil.emulator.launch import Emulator, with_own_seeds
     from starhil.emulator.links.table import LINKS
     from starhil.emulator.profile import DEFAULT_PROFILE
+    from starhil.emulator.simulation.threads import run_loop
 
     levels = ("debug", "info", "warning", "error")
     if log not in levels:
@@ -288,7 +318,7 @@ def command(
             "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
         )
     options = around.run_options()
-    return asyncio.run(_serve(lambda: Emulator(profiles, options, worker)))
+    return run_loop(_serve(lambda: Emulator(profiles, options, worker)))
 
 
 async def _serve(make: Callable[[], Emulator]) -> int:

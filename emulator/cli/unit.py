@@ -90,14 +90,19 @@ def check(
 ) -> None:
     """Check a unit: list all errors, or show an example exchange of each row in hexadecimal.
 
-    This runs the unit's plugin, a Python file, if it has one: check a unit from elsewhere with --no-plugin. The exit
-    status is 0 if there are no errors, otherwise 1.
+    This runs the unit's plugin, a Python file, if it has one, and calls its quantities: check a unit from elsewhere with
+    --no-plugin. The exit status is 0 if there are no errors, otherwise 1.
     """
     from starhil.protocol.export.describe import value_text
     from starhil.protocol.unit.examples import examine
 
     definition, errors, examples = examine(unit, run_plugin=not no_plugin)
     skipped = definition.plugin.skipped if no_plugin else None
+    if definition.plugin.quantities and not errors:
+        from starhil.emulator.device.plugin_check import failing_quantities
+        from starhil.emulator.profile import Profile
+
+        errors = failing_quantities(definition, Profile.model_validate({"unit": unit}))
     if as_json:
         shown = [
             {

@@ -147,8 +147,12 @@ class McapRecorder:
 
     async def close(self) -> None:
         """Write pending messages and the index, and close the file."""
-        self._head.imager.watchers.discard(self)
-        self._head.traffic.passed.disconnect(self._record_traffic)
+        head = self._head
+        head.imager.watchers.discard(self)
+        head.device.signals.frame_published.disconnect(self._record_frame)
+        self._events.added.disconnect(self._record_event)
+        head.device.signals.faults_changed.disconnect(self._record_faults)
+        head.traffic.passed.disconnect(self._record_traffic)
         self._write_traffic()
         if self._task is not None:
             self._task.cancel()

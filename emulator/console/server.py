@@ -12,7 +12,7 @@ import secrets
 import socket
 import sys
 import zlib
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, cast
 from urllib.parse import quote, urlsplit
@@ -66,6 +66,9 @@ TURN_S: Final = 0.002
 PAGE_TURN_S: Final = 0.01
 """Shortest time between two requests of a page, seconds."""
 
+EXPORT_PAUSE_S: Final = 0.2
+"""Shortest time between two exports, of any pages, seconds."""
+
 OPENING_S: Final = 0.05
 """Shortest time between two pages that open, seconds."""
 
@@ -105,6 +108,8 @@ class ConsoleServer:
         self._view_token = view_token
         self._turn = asyncio.Lock()
         self._opening = asyncio.Lock()
+        self._exporting = asyncio.Lock()
+        """Held while a thread makes an export: several would take the interpreter from the links."""
         self._files: dict[str, tuple[bytes, str]] = {}
         """Files of the page that have been read: compressed, and their tag."""
         self._runner: web.AppRunner | None = None
@@ -234,19 +239,28 @@ class ConsoleServer:
         return _download(text, "session.toml", "application/toml")
 
     async def _wire_log(self, request: web.Request) -> web.Response:
-        return _download(self._console(request).trace.candump(), "wire.log", "text/plain")
+        trace = self._console(request).trace
+        async with self._export_turn():
+            text = await in_thread(trace.candump, trace.items())
+        return _download(text, "wire.log", "text/plain")
 
     async def _wire_text(self, request: web.Request) -> web.Response:
-        text = await in_thread(self._console(request).trace.text)
+        trace = self._console(request).trace
+        async with self._export_turn():
+            text = await in_thread(trace.text, trace.items())
         return _download(text, "wire.txt", "text/plain")
 
     async def _wire_pcapng(self, request: web.Request) -> web.Response:
-        data = await in_thread(pcapng, self._console(request).trace.items())
+        trace = self._console(request).trace
+        async with self._export_turn():
+            data = await in_thread(pcapng, trace.items())
         return _download(data, "wire.pcapng", "application/octet-stream")
 
     async def _record(self, request: web.Request) -> web.Response:
         """Return what is known of the last hour as an MCAP file."""
-        data = await self._console(request).recording()
+        console = self._console(request)
+        async with self._export_turn():
+            data = await console.recording()
         return _download(data, "record.mcap", "application/octet-stream")
 
     async def _report(self, request: web.Request) -> web.Response:
@@ -269,7 +283,7 @@ class ConsoleServer:
         console = self._console(request)
         if sum(len(each.viewers) for each in self._consoles) >= MAX_VIEWERS:
             return web.Response(status=503, text=f"503: {MAX_VIEWERS} pages are already open\n")
-        socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE)
+        socket = web.WebSocketResponse(autoping=False, heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE)
         await socket.prepare(request)
         if request.transport is not None:
             _limit_unsent(request.transport)
@@ -297,6 +311,13 @@ class ConsoleServer:
             await asyncio.gather(*tasks, return_exceptions=True)
         return socket
 
+    @contextlib.asynccontextmanager
+    async def _export_turn(self) -> AsyncIterator[None]:
+        """Wait until no other export is being made, and the links have had the interpreter for a while."""
+        async with self._exporting:
+            await asyncio.sleep(EXPORT_PAUSE_S)
+            yield
+
     async def _wait_for_turn(self) -> None:
         """Wait until `TURN_S` have passed since the request before, of any page."""
         async with self._turn:
@@ -305,10 +326,15 @@ class ConsoleServer:
     async def _receive(
         self, console: Console, socket: web.WebSocketResponse, viewer: Viewer, tasks: set[asyncio.Task[None]]
     ) -> None:
-        """Execute the requests of a page until it closes."""
+        """Execute the requests of a page until it closes.
+
+        Pings and pongs have their turns too: aiohttp would answer a flood of them without leaving the loop.
+        """
         async for message in socket:
             await asyncio.sleep(PAGE_TURN_S)
             await self._wait_for_turn()
+            if message.type is WSMsgType.PING:
+                await socket.pong(message.data)
             if message.type is not WSMsgType.TEXT:
                 continue
             try:

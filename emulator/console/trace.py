@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -145,27 +145,27 @@ class WireTrace:
                 content["python"] = _python(row, fields)
         return content
 
-    def candump(self) -> str:
-        """Return the recorded CAN frames as a candump log with the name of their bus."""
+    def candump(self, items: Sequence[WireItem]) -> str:
+        """Return the CAN frames of recorded items as a candump log with the name of their bus."""
         name = bus_name(self._channel())
         return "".join(
             format_candump(replace(entry.item, timestamp=entry.at_s), name) + "\n"
-            for entry in self._kept
+            for entry in items
             if isinstance(entry.item, CanFrame) and entry.bus != CONSOLE_BUS
         )
 
-    def text(self) -> str:
-        """Return the recorded traffic of all links, decoded, one item a line."""
+    def text(self, items: Sequence[WireItem]) -> str:
+        """Return recorded items of all links, decoded, one a line."""
         decoder = Decoder(self._icd, self._dialect, self._objects)
         lines = []
-        for item in self._kept:
+        for item in items:
             line = decoder.line(item)
             way = "device→" if item.outgoing else "→device"
             lines.append(f"{item.at_s:.6f}  {item.bus:<7}  {way}  {line['text']}  [{line['raw']}]\n")
         return "".join(lines)
 
     def items(self) -> list[WireItem]:
-        """Return the recorded items, oldest first."""
+        """Return the recorded items, oldest first: a list that traffic does not change while a thread reads it."""
         return list(self._kept)
 
 

@@ -11,6 +11,7 @@ attitude stays valid until it is too old, and tracking continues from it.
 from __future__ import annotations
 
 import logging
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -46,7 +47,9 @@ from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.icd.values import Value
 from starid.arrays import Array
 from starid.attitude import ARCSEC_PER_RAD, Attitude
+from starid.elementary import square
 from starid.identification.attitude_history import AttitudeHistory
+from starid.matrices import length
 
 log = logging.getLogger("starhil.device")
 
@@ -416,11 +419,11 @@ class FrameCycle:
         across, about = (
             sigma / ARCSEC_PER_RAD for sigma in (result.sigma_cross_arcsec, result.sigma_roll_arcsec)
         )
-        known = np.diag([across**2, across**2, about**2]) if min(across, about) > 0.0 else None
+        known = np.diag([square(across), square(across), square(about)]) if min(across, about) > 0.0 else None
         self._history.add(frame.mid_ns, attitude, LONGEST_GAP_PERIODS * frame.period_s, known)
         rate = result.rate_rad_s or self._history.rate()
         if processing_s * 1000.0 > float(self._parameters["detection_timeout"]):
             return False, "timeout", rate
-        if rate is not None and np.linalg.norm(rate) > np.radians(float(self._parameters["max_rate"])):
+        if rate is not None and length(np.array(rate)) > math.radians(float(self._parameters["max_rate"])):
             return False, "rate_too_high", rate
         return True, "ok", rate

@@ -1,7 +1,8 @@
 """Files for download: their list, loading in blocks, bursts of numbered packets, and the hole map of received packets.
 
-The files are the stored images as `bmp`, those compressed from them as `jpg`, and an `index` with 12 bytes per file: `<type u8, counter u8, edge u16,
-size u32, frame u32>`. The layout of the index is not public; this one is our own choice.
+The files are the stored images as `bmp`, those compressed from them as `jpg`, and an `index` with 12 bytes per file:
+`<type u8, counter u8, edge u16, size u32, frame u32>`. The layout of the index is not public; this one is our own
+choice.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Images for download: capture, storage, compression and transfer.
 
-Stored images are files, and so are those compressed from them; a new one replaces the oldest. A download keeps the image that it has opened.
+Stored images are files, and so are those compressed from them; a new one replaces the oldest. A download keeps the
+image that it has opened.
 """
 
 from __future__ import annotations

@@ -9,6 +9,7 @@ from typing import Final
 
 from starhil.emulator.profile.sections import PowerConfig, ThermalConfig
 from starhil.protocol.icd.conventions import NANOSECONDS
+from starid.elementary import cos, exp, sin
 
 MILLI: Final = 1e-3
 
@@ -88,7 +89,7 @@ class PowerModel:
     def mean_power_w(self, timing: FrameTiming) -> float:
         """Return the power averaged over a period, watts."""
         lasting = self.durations_s(timing)
-        energy = sum(self.power_w(phase) * seconds for phase, seconds in lasting.items())
+        energy = math.fsum(self.power_w(phase) * seconds for phase, seconds in lasting.items())
         return energy / timing.period_s
 
 
@@ -111,14 +112,14 @@ class ThermalState:
     def heating_c(self, now_ns: int) -> float:
         """Return the heating at a simulation time, degrees."""
         elapsed_s = max(now_ns - self.since_ns, 0) / NANOSECONDS
-        left = math.exp(-elapsed_s / self.config.time_constant_s)
+        left = exp(-elapsed_s / self.config.time_constant_s)
         return self.towards_c + (self.rise_c - self.towards_c) * left
 
     def mounting_c(self, now_ns: int) -> float:
         """Return the temperature of the mounting, °C."""
         config = self.config
         turn = 2.0 * math.pi * (now_ns / NANOSECONDS) / config.period_s
-        return config.mounting_c + config.swing_c * math.sin(turn)
+        return config.mounting_c + config.swing_c * sin(turn)
 
     def temperature_c(self, now_ns: int) -> float:
         """Return the temperature of detector and lens, °C."""
@@ -130,8 +131,8 @@ class ThermalState:
         span_s = (to_ns - from_ns) / NANOSECONDS
         turn, time_s = 2.0 * math.pi / config.period_s, config.time_constant_s
         one_s, other_s = ((ns - self.since_ns) / NANOSECONDS for ns in (from_ns, to_ns))
-        swing = math.cos(turn * from_ns / NANOSECONDS) - math.cos(turn * to_ns / NANOSECONDS)
-        fall = math.exp(-max(one_s, 0.0) / time_s) - math.exp(-max(other_s, 0.0) / time_s)
+        swing = cos(turn * from_ns / NANOSECONDS) - cos(turn * to_ns / NANOSECONDS)
+        fall = exp(-max(one_s, 0.0) / time_s) - exp(-max(other_s, 0.0) / time_s)
         heating = self.towards_c + (self.rise_c - self.towards_c) * time_s * fall / span_s
         return config.mounting_c + config.swing_c * swing / (turn * span_s) + heating
 

@@ -165,6 +165,8 @@ _attitude("attitude.ra", lambda reported: reported.mounted.ra_deg)
 _attitude("attitude.dec", lambda reported: reported.mounted.dec_deg)
 _attitude("attitude.roll", lambda reported: reported.mounted.roll_deg)
 _vector("attitude.rotation_", lambda snapshot: snapshot.reported.rotation_vector_rad)
+_vector("attitude.gibbs_", lambda snapshot: snapshot.reported.gibbs_vector)
+_vector("attitude.mrp_", lambda snapshot: snapshot.reported.modified_rodrigues)
 for _axis, _letter in enumerate("xyz"):
     _attitude(
         f"attitude.dcm_{_letter}[n]",

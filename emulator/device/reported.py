@@ -18,6 +18,8 @@ from starhil.emulator.sensor.pipeline.messages import ZERO, Quaternion, Triple, 
 from starhil.protocol.icd.conventions import Conventions
 from starid.arrays import Array
 from starid.attitude import Attitude
+from starid.elementary import atan2, hypot
+from starid.matrices import length
 
 _IDENTITY: Final = Attitude.identity()
 
@@ -26,6 +28,9 @@ SEQUENCES: Final = tuple(a + b + c for a, b, c in product("xyz", repeat=3) if a 
 
 GIMBAL_LOCK_RAD: Final = 1e-7
 """With a second Euler angle this near to where the first and third axes coincide, the third angle is 0."""
+
+SMALLEST_SCALAR: Final = 1e-12
+"""Smallest scalar part by which a Gibbs vector is divided."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +64,28 @@ class Reported:
         """Rotation vector of the quaternion in the convention of the unit, of at most π."""
         x, y, z, w = self.quaternion_xyzw
         sine = math.sqrt(x * x + y * y + z * z)
-        scale = 2.0 if sine == 0.0 else 2.0 * math.atan2(math.copysign(sine, w), abs(w)) / sine
+        scale = 2.0 if sine == 0.0 else 2.0 * atan2(math.copysign(sine, w), abs(w)) / sine
         return (scale * x, scale * y, scale * z)
+
+    @property
+    def gibbs_vector(self) -> Triple:
+        """Gibbs or Rodrigues vector of the quaternion in the convention of the unit, tan(φ/2) along the axis.
+
+        It grows without bound towards half a turn, so that its length ends at about 10¹².
+        """
+        return self._vector_part_over(
+            math.copysign(max(abs(self.quaternion_xyzw[3]), SMALLEST_SCALAR), self.quaternion_xyzw[3])
+        )
+
+    @property
+    def modified_rodrigues(self) -> Triple:
+        """Modified Rodrigues parameters of the quaternion in the convention of the unit, tan(φ/4) along the axis, of at most 1."""
+        w = self.quaternion_xyzw[3]
+        return self._vector_part_over(w + math.copysign(1.0, w))
+
+    def _vector_part_over(self, divisor: float) -> Triple:
+        x, y, z, _ = self.quaternion_xyzw
+        return (x / divisor, y / divisor, z / divisor)
 
     def euler_rad(self, sequence: str) -> Triple:
         """Return the Euler angles that turn the ICRS axes to the reported axes, (3,), rad.
@@ -82,8 +107,8 @@ class Reported:
         a, b, c, d = q[3], q[i], q[j], q[k] * sign
         if not proper:
             a, b, c, d = a - c, b + d, c + a, d - b
-        second = 2.0 * math.atan2(math.hypot(c, d), math.hypot(a, b))
-        half_sum, half_difference = math.atan2(b, a), math.atan2(d, c)
+        second = 2.0 * atan2(hypot(c, d), hypot(a, b))
+        half_sum, half_difference = atan2(b, a), atan2(d, c)
         if second < GIMBAL_LOCK_RAD:
             first, third = 2.0 * half_sum, 0.0
         elif second > math.pi - GIMBAL_LOCK_RAD:
@@ -147,8 +172,8 @@ def axes_turns(rows: tuple[tuple[int, int, int], ...]) -> tuple[Array, ...]:
     """Return the rotation vector from sensor axes to reported axes, radians, for the rows of `Conventions.rows`."""
     matrix = np.array(rows, dtype=np.float64)
     *axis, w = Attitude.from_matrix(matrix.T).quaternion_xyzw.tolist()
-    sine = float(np.linalg.norm(axis))
-    return (_read_only(np.array(axis) / sine * 2.0 * math.atan2(sine, w)),) if sine > 0.0 else ()
+    sine = length(np.array(axis))
+    return (_read_only(np.array(axis) / sine * 2.0 * atan2(sine, w)),) if sine > 0.0 else ()
 
 
 def mounting_turns(parameters: Mapping[str, ParameterValue]) -> tuple[Array, ...]:

@@ -96,6 +96,12 @@ class Requests:
             log.debug("%s: %s", fault.kind.value, fault.detail)
             self.device.counters = self.device.counters.with_fault(fault)
 
+    def count_overrun(self) -> None:
+        """Flag the loss of a request that arrived while too many others waited."""
+        if not self.device.unresponsive:
+            log.debug("a request is lost, because too many wait")
+            self.device.counters = self.device.counters.with_overrun()
+
     def telemetry(self, name: str, snapshot: Snapshot, hits: Hits = ()) -> bytes:
         """Return the data of a telemetry row at one moment, with the faults of the message.
 

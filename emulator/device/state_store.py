@@ -24,6 +24,8 @@ CANOPEN_FILE: Final = "canopen.json"
 """Beside it, the parameters of a CANopen node, which `protocol.canopen.storage` writes."""
 LOCK_FILE: Final = "lock"
 MAX_BYTES: Final = 1_000_000
+_LOCK: Final = os.O_CREAT | os.O_RDWR | os.O_CLOEXEC | os.O_NOFOLLOW
+"""Flags of the lock's file, which is no link that others have put there."""
 
 
 class MemoryStore:
@@ -55,7 +57,7 @@ class FileStore:
         self.path = folder / STATE_FILE
         with explained(f"state folder {folder}: cannot be used", "choose another with --state-dir"):
             folder.mkdir(parents=True, exist_ok=True)
-            self._lock = os.open(folder / LOCK_FILE, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o644)
+            self._lock = os.open(folder / LOCK_FILE, _LOCK, 0o644)
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -76,7 +78,8 @@ class FileStore:
                 content = None
         if content is None:
             self.corrupt = True
-            self.path.replace(self.path.with_name(STATE_FILE + ".corrupt"))
+            with explained(f"state file {self.path}: is corrupt, and cannot be renamed", "remove it"):
+                self.path.replace(self.path.with_name(STATE_FILE + ".corrupt"))
             return {}
         return content
 

@@ -35,13 +35,16 @@ from starhil.protocol.icd.values import FieldError, Value
 from starhil.protocol.messages import Flaw, Reply
 from starid.arrays import Array
 from starid.attitude import Attitude
+from starid.elementary import cos, sin
 
 MAX_FAULTS: Final = 32
 """Most faults of telemetry at a time."""
 Duration = Annotated[float, Field(ge=0.0, le=1e7)]
 Names = Annotated[list[str], Field(default_factory=list, max_length=100)]
 Angle = Annotated[float, Field(ge=-360.0, le=360.0)]
-VECTOR_PART: Final = frozenset(f"attitude.{part}{axis}" for part in ("", "rotation_") for axis in "xyz")
+VECTOR_PART: Final = frozenset(
+    f"attitude.{part}{axis}" for part in ("", "rotation_", "gibbs_", "mrp_") for axis in "xyz"
+)
 """Quantities whose sign is that of the direction of the rotation."""
 
 
@@ -67,7 +70,8 @@ class TelemetryFault(Strict):
     every_s: Duration | None = None
     """Period in which the fault returns."""
     freeze: Literal["attitude", "all"] | None = None
-    """What stays as in the first affected message: `attitude` (with its rates, stars, covariance and validity, while counters and times go on) or `all`."""
+    """What stays as in the first affected message: `attitude` (with its rates, stars, covariance and validity, while
+    counters and times go on) or `all`."""
     turn_deg: Annotated[list[Angle], Field(min_length=3, max_length=3)] | None = None
     """Turn the attitude and the star vectors by these angles about x, y and z of the sensor (a rotation vector); all flags stay good."""
     jump_deg: Annotated[float, Field(ge=0.0, le=180.0)] = 0.0
@@ -189,7 +193,7 @@ class Injected:
         one = random.Random(f"{self._seed} {counter}")  # noqa: S311
         z, angle = one.uniform(-1.0, 1.0), one.uniform(-math.pi, math.pi)
         across = math.sqrt(1.0 - z * z)
-        return np.array([across * math.cos(angle), across * math.sin(angle), z])
+        return np.array([across * cos(angle), across * sin(angle), z])
 
     def changed(self, row: Row, data: bytes) -> bytes:
         """Return other data of a row."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.launch.machine import other_machine
 from starhil.emulator.launch.recording import copy_state, read_recorded, read_run, validated
 from starhil.emulator.launch.replay_differences import difference_of_truth, difference_sent, units_sent
+from starhil.emulator.launch.replay_fields import FieldDifference, differing_fields
 from starhil.emulator.links.traffic import Decoder, WireItem
 from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
@@ -172,7 +173,10 @@ class PlayedPipeline:
         await self._inner.settle()
 
     async def deliver(self, ended: PipelineEnded | None) -> None:
-        """Deliver the next reply, or `ended` in its place; _DeviationError if the device has sent fewer requests than in the recorded run."""
+        """Deliver the next reply, or `ended` in its place.
+
+        _DeviationError if the device has sent fewer requests than in the recorded run.
+        """
         if not self._arrived:
             await self._inner.settle()
         if not self._arrived:
@@ -194,6 +198,8 @@ class ReplayReport:
 
     Empty if all are identical.
     """
+    fields: list[FieldDifference] = field(default_factory=list)
+    """Fields of messages that differ, by link, row and field."""
 
 
 def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
@@ -217,11 +223,14 @@ def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
             yield where, entry
 
 
-async def replay(folder: Path, profile: Profile | None = None, unit: str | None = None) -> ReplayReport:
+async def replay(
+    folder: Path, profile: Profile | None = None, unit: str | None = None, settings: Sequence[str] = ()
+) -> ReplayReport:
     """Play a recording on the stepped clock, and compare sent items and measurements with it.
 
-    The device may have another profile than the recorded one, or another unit; `run` except the algorithm, and `links`,
-    are as recorded. A recorded unit with a Python file of its own is rejected, because others may have made the recording.
+    The device may have another profile than the recorded one, another unit, or other values of the recorded profile's keys
+    (`settings`, as `section.key=value`); `run` except the algorithm, and `links`, are as recorded. A recorded unit with a
+    Python file of its own, or camera, is rejected, because others may have made the recording.
     """
     recording_of = read_run(folder)
     recorded = recording_of.profile
@@ -229,6 +238,10 @@ async def replay(folder: Path, profile: Profile | None = None, unit: str | None 
         recorded = recorded.model_copy(update={"unit": unit})
     elif profile is None:
         check_runs_no_code(recorded.unit_source, f"replay {folder}: the recording")
+    if profile is None and not any(setting.startswith("images.capture") for setting in settings):
+        _check_opens_no_camera(recorded, folder)
+    if settings and profile is None:
+        profile = recorded.with_overrides(settings)
     player = Player(ends_at_once=recorded.run.clock == "stepped")
     report = ReplayReport()
     with tempfile.TemporaryDirectory(prefix="starhil-replay-") as scratch:
@@ -267,6 +280,7 @@ async def replay(folder: Path, profile: Profile | None = None, unit: str | None 
                 report.sent[link] = len(list(units_sent(before)))
                 if difference := difference_sent(before, now, new_decoder, to_the_end=to_the_end):
                     report.differences.append(f"{link}: {difference}")
+                    report.fields += differing_fields(link, before, now, new_decoder, to_the_end=to_the_end)
         finally:
             await again.close()
             log.close()
@@ -275,6 +289,19 @@ async def replay(folder: Path, profile: Profile | None = None, unit: str | None 
     if report.differences and (machine := other_machine(recording_of.machine)):
         report.differences.append(machine)
     return report
+
+
+def _check_opens_no_camera(recorded: Profile, folder: Path) -> None:
+    """Check that the images of a recording are not from a camera, file, address or pipeline that OpenCV would open.
+
+    Others may have named it, and it has other images now.
+    """
+    capture = recorded.images.capture
+    if capture != "":
+        raise EmulatorError(
+            f"replay {folder}: images.capture: the recording took images from {capture!r}, which it does not contain; give a "
+            "profile of your own: --profile"
+        )
 
 
 class _Playing:

@@ -30,6 +30,11 @@ FLUSH_MARGIN_S: Final = 0.01
 """An incomplete message is dropped this much later than the receiver's timeout."""
 
 
+MAX_HELD: Final = 256
+"""Number of requests that wait for the answer to an earlier one; further ones are lost, as in the buffer of a device, and flagged
+as an overrun. They are answered at once when it is over, which takes some 25 ms."""
+
+
 @dataclass
 class ObcRequests:
     """Requests of the OBC on a link, without those of the console."""
@@ -209,6 +214,9 @@ class RequestLink(Link[Item], Generic[Item, Style]):
     def _receive(self, item: Item) -> None:
         self._held_input.extend(self._receiver.feed(item, self._now()))
         self._dispatch_waiting()
+        while len(self._held_input) > MAX_HELD:
+            self._held_input.pop()
+            self._requests.count_overrun()
         self._schedule_flush()
 
     def _dispatch_waiting(self) -> None:

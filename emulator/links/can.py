@@ -17,6 +17,7 @@ from starhil.protocol.can.cubespace import CanDeviceReceiver, CanId, encode_repl
 from starhil.protocol.can.frame import MAX_EXTENDED_ID, MAX_FRAME_DATA, MAX_STANDARD_ID, CanFrame
 from starhil.protocol.messages import Reply, Request
 from starhil.protocol.transports.base import Transport
+from starhil.protocol.transports.python_can import QUEUE_LIMIT
 
 
 class CanDamage:
@@ -102,6 +103,9 @@ class CanLink(RequestLink[CanFrame, int]):
     def _transmit(self, item: CanFrame) -> None:
         if self._gap_s <= 0.0:
             super()._transmit(item)
+            return
+        if len(self._waiting) >= QUEUE_LIMIT:
+            self.transport.statistics.dropped += 1
             return
         self._waiting.append(item)
         if self._next is None:

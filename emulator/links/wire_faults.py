@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Annotated, Generic, Protocol, TypeVar
+from typing import Annotated, Final, Generic, Protocol, TypeVar
 
 from pydantic import Field
 
@@ -16,6 +16,9 @@ from starhil.protocol.icd.conventions import NANOSECONDS
 
 Item = TypeVar("Item")
 
+
+MAX_DELAYED: Final = 10_000
+"""Number of items that are held back; further ones are lost."""
 
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
@@ -109,6 +112,8 @@ class WireFaults(Generic[Item]):
         at_ns = max(now_ns + round(settings.delay_s * NANOSECONDS), self._free_ns)
         gap_ns = round(settings.gap_s * NANOSECONDS) if len(pieces) > 1 else 0
         for piece in pieces:
+            if len(self._held) >= MAX_DELAYED:
+                break
             if at_ns > now_ns or self._held:
                 self._held.append((at_ns, piece))
             else:

@@ -147,6 +147,11 @@ class Profile(Strict):
         self._layers = tuple(layers)
         return self
 
+    def with_overrides(self, overrides: Sequence[str]) -> Profile:
+        """Return the profile with `section.key=value` overrides, as `load_profile` applies them."""
+        path = Path(self.name) if self._source is None else self._source
+        return _overridden(path, self.model_dump(exclude_unset=True), [], overrides)
+
     def source_of(self, error: object) -> str:
         """Return the source of the key with which an error begins: an option `--set`, or a file."""
         location = str(error).partition(": ")[0].split(".")
@@ -217,6 +222,11 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
         if "camera" in table:
             _drop_parameters_of_camera(values)
         values = merge(values, table)
+    return _overridden(path, values, layers, overrides)
+
+
+def _overridden(path: Path, values: dict[str, Any], layers: list[Layer], overrides: Sequence[str]) -> Profile:
+    """Apply overrides to the values of a profile, and validate them."""
     if any(override.startswith("camera.") for override in overrides):
         _drop_parameters_of_camera(values)
     presets = [override for override in overrides if override.partition("=")[0].strip() == "orbit"]

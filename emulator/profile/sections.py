@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from starhil.emulator.simulation.config_model import Date, Strict, UserPath
 from starhil.emulator.truth.config import InProfileFolder, profile_paths
+from starid.elementary import square
 
 FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
 """Duration of one stage of a frame, seconds."""
@@ -138,7 +139,8 @@ class CalibrationConfig(BaseModel):
             return None
         for i, j in product(range(9), repeat=2):
             possible = (
-                min(rows[i][i], rows[j][j]) >= 0.0 and rows[i][j] ** 2 <= 1.000001 * rows[i][i] * rows[j][j]
+                min(rows[i][i], rows[j][j]) >= 0.0
+                and square(rows[i][j]) <= 1.000001 * rows[i][i] * rows[j][j]
             )
             if not possible or not math.isclose(rows[i][j], rows[j][i], rel_tol=1e-6):
                 raise ValueError(f"row {i + 1}, column {j + 1} is not that of a covariance matrix")
@@ -149,7 +151,7 @@ class CalibrationConfig(BaseModel):
         if self.covariance is not None or self.sigma is None:
             return self.covariance
         rows = [
-            [sigma**2 if row == column else 0.0 for column in range(9)]
+            [square(sigma) if row == column else 0.0 for column in range(9)]
             for row, sigma in enumerate(self.sigma)
         ]
         rows[0][1] = rows[1][0] = self.sigma[0] * self.sigma[1]
@@ -292,7 +294,8 @@ class CanConfig(Strict):
     """The CAN link."""
 
     channel: str = "auto"
-    """`auto` (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a python-can channel, or `off`."""
+    """`auto` (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a python-can
+    channel, or `off`."""
     address: Annotated[int, Field(ge=1, le=254)] = 4
     """CAN address of the device."""
     host_address: Annotated[int, Field(ge=1, le=254)] = 1

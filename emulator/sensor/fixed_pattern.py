@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from starhil.emulator.sensor.model import SensorModel
-from starid.arrays import Array32, Indices
+from starid.arrays import Array32, Indices, elementwise
+from starid.elementary import exp, power, square
 
 _HOT_LOG_SPREAD: Final = 1.0
 
@@ -90,7 +91,7 @@ def make_fixed_pattern(sensor: SensorModel, height: int, width: int) -> FixedPat
         width,
         pixels,
         spreads,
-        sensor.pixel_um**2 * sensor.epi_um * sensor.damage_tev_g,
+        square(sensor.pixel_um) * sensor.epi_um * sensor.damage_tev_g,
     )
 
 
@@ -116,9 +117,11 @@ def _draw(
         np.maximum(sensitivity, 0.0, out=sensitivity)
     dark = np.full(size, dark_e_s, dtype=np.float32)
     if dsnu > 0.0:
-        shape = 1.0 / dsnu**2
+        shape = 1.0 / square(dsnu)
         dark = rng.standard_gamma(shape, size, dtype=np.float32) * np.float32(dark_e_s / shape)
-    dark[hot] += (hot_e_s * np.exp(_HOT_LOG_SPREAD * rng.standard_normal(hot.size))).astype(np.float32)
+    dark[hot] += (hot_e_s * elementwise(exp, _HOT_LOG_SPREAD * rng.standard_normal(hot.size))).astype(
+        np.float32
+    )
     rng = np.random.default_rng((seed, height, width, 1))
     if damage > 0.0:
         cascades = rng.poisson(damage / _DAMAGE_UM3_TEV_G, size)
@@ -127,7 +130,7 @@ def _draw(
     telegraph = TelegraphSignals(
         switching,
         rng.exponential(_TELEGRAPH_E_S, switching.size).astype(np.float32),
-        np.rint(_LONGEST_DWELL ** rng.random(switching.size)).astype(np.int64),
+        np.rint(elementwise(partial(power, _LONGEST_DWELL), rng.random(switching.size))).astype(np.int64),
         seed,
     )
     sensitivity[dead] = 0.0

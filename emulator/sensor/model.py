@@ -12,13 +12,14 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.simulation.limited import limited
 from starid.arrays import Array
 from starid.attitude import ARCSEC_PER_RAD
+from starid.elementary import hypot, log10, power, square
 
 if TYPE_CHECKING:
     from starhil.emulator.sensor.noise import Digitizer
     from starid.camera import Camera
     from starid.imaging.detection import DetectionSettings
 
-ARCSEC2_PER_SR: Final = (180.0 * 3600.0 / math.pi) ** 2
+ARCSEC2_PER_SR: Final = square(180.0 * 3600.0 / math.pi)
 SOLAR_COLOUR_B_V: Final = 0.65
 """B−V of a star for which the colour term is zero."""
 
@@ -129,13 +130,13 @@ class SensorModel:
     @property
     def zero_magnitude_e_s(self) -> float:
         """Return electrons/s from a star of V = 0 and solar colour."""
-        area = math.pi / 4.0 * self.aperture_m**2
+        area = math.pi / 4.0 * square(self.aperture_m)
         return self.zero_point_photons_s_m2 * area * self.transmission * self.quantum_efficiency
 
     def electrons(self, magnitude: float, exposure_s: float | None = None) -> float:
         """Return the mean number of electrons from a star of a sensor magnitude in one exposure."""
         exposure = self.exposure_s if exposure_s is None else exposure_s
-        return self.zero_magnitude_e_s * exposure * math.pow(10.0, -0.4 * magnitude)
+        return self.zero_magnitude_e_s * exposure * power(10.0, -0.4 * magnitude)
 
     def faintest_magnitude(self, pixel_scale_rad: float, threshold: float) -> float:
         """Return the magnitude of a star whose signal in the matched filter is `threshold` standard deviations of the noise.
@@ -145,19 +146,19 @@ class SensorModel:
         """
         dark_e_s = self.dark_e_s * self.dark_factor(self.temperature_c)
         light = (self.sky_e_s(pixel_scale_rad) + dark_e_s) * self.exposure_s
-        noise_e = math.sqrt(light + self.read_noise_e**2 + self.gain_e_per_dn**2 / 12.0)
-        spot_px = math.hypot(self.psf_sigma_px * (1.0 + self.psf_growth / 3.0), 1.0 / math.sqrt(12.0))
+        noise_e = math.sqrt(light + square(self.read_noise_e) + square(self.gain_e_per_dn) / 12.0)
+        spot_px = hypot(self.psf_sigma_px * (1.0 + self.psf_growth / 3.0), 1.0 / math.sqrt(12.0))
         electrons = threshold * noise_e * math.sqrt(4.0 * math.pi) * spot_px
-        return -2.5 * math.log10(electrons / (self.zero_magnitude_e_s * self.exposure_s))
+        return -2.5 * log10(electrons / (self.zero_magnitude_e_s * self.exposure_s))
 
     def sky_e_s(self, pixel_scale_rad: float) -> float:
         """Return electrons/s per pixel from the sky background, for pixels of width `pixel_scale_rad`."""
-        arcsec2 = pixel_scale_rad**2 * ARCSEC2_PER_SR
-        return self.zero_magnitude_e_s * arcsec2 * math.pow(10.0, -0.4 * self.sky_mag_arcsec2)
+        arcsec2 = square(pixel_scale_rad) * ARCSEC2_PER_SR
+        return self.zero_magnitude_e_s * arcsec2 * power(10.0, -0.4 * self.sky_mag_arcsec2)
 
     def dark_factor(self, temperature_c: float) -> float:
         """Return the dark current at a temperature relative to that at `reference_c`."""
-        return math.pow(2.0, (temperature_c - self.reference_c) / self.dark_doubling_c)
+        return power(2.0, (temperature_c - self.reference_c) / self.dark_doubling_c)
 
     def camera_at(self, camera: Camera, temperature_c: float) -> Camera:
         """Return the camera at a temperature; unchanged at `reference_c` or without drift."""

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array32, GreyImage
+from starid.elementary import hypot
 from starid.kernels.jit import compiled_ieee, inner
 
 LANES: Final = 512
@@ -204,11 +205,9 @@ def digitize(expected_e: Array32, digitizer: Digitizer, seed: int, frame_index: 
     pair and input give the same bytes.
     """
     rounding_e = digitizer.gain_e_per_dn / math.sqrt(12.0)
-    few = FEW_ELECTRONS if math.hypot(digitizer.read_noise_e, rounding_e) < QUIET_NOISE_E else -1.0
+    few = FEW_ELECTRONS if hypot(digitizer.read_noise_e, rounding_e) < QUIET_NOISE_E else -1.0
     near_full = digitizer.full_well_e - _WELL_MARGIN_SIGMA * math.sqrt(digitizer.full_well_e)
-    least_e = near_full - _WELL_MARGIN_SIGMA * math.hypot(
-        math.sqrt(digitizer.full_well_e), digitizer.read_noise_e
-    )
+    least_e = near_full - _WELL_MARGIN_SIGMA * hypot(math.sqrt(digitizer.full_well_e), digitizer.read_noise_e)
     if few < 0.0 and least_e / digitizer.gain_e_per_dn + digitizer.offset_dn > digitizer.max_dn:
         near_full = math.inf  # the converter saturates before the well, so no pixel needs a Poisson number
     levels = (

@@ -12,7 +12,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, Array32
+from starid.arrays import Array, Array32, elementwise
+from starid.elementary import cos, log, sin, square
 
 _STEP_PX: Final = 0.1
 _LEAST_COSINE: Final = 0.02
@@ -45,11 +46,11 @@ def stopping_power(energy_mev: npt.ArrayLike) -> Array:
     at 2 GeV and less below.
     """
     gamma = 1.0 + np.asarray(energy_mev, dtype=np.float64) / _PROTON_MEV
-    beta2 = 1.0 - 1.0 / gamma**2
+    beta2 = 1.0 - 1.0 / square(gamma)
     ratio = _ELECTRON_MEV / _PROTON_MEV
-    transfer = 2.0 * _ELECTRON_MEV * beta2 * gamma**2
-    largest = transfer / (1.0 + 2.0 * gamma * ratio + ratio**2)
-    logarithm = 0.5 * np.log(transfer * largest / _EXCITATION_MEV**2) - beta2
+    transfer = 2.0 * _ELECTRON_MEV * beta2 * square(gamma)
+    largest = transfer / (1.0 + 2.0 * gamma * ratio + square(ratio))
+    logarithm = 0.5 * elementwise(log, transfer * largest / square(_EXCITATION_MEV)) - beta2
     return np.asarray(_COUPLING * _CHARGE_PER_MASS / beta2 * logarithm)
 
 
@@ -70,10 +71,13 @@ def add_protons(
     height, width = mean_e.shape
     start = rng.uniform((-0.5, -0.5), (width - 0.5, height - 0.5), (count, 2))
     cosine = np.maximum(np.sqrt(rng.random(count)), _LEAST_COSINE)
-    run_px = epi_um / pixel_um * np.sqrt(1.0 - cosine**2) / cosine
+    run_px = epi_um / pixel_um * np.sqrt(1.0 - square(cosine)) / cosine
     azimuth = rng.uniform(0.0, 2.0 * math.pi, count)
     ends = np.column_stack(
-        [start, start + run_px[:, None] * np.column_stack([np.cos(azimuth), np.sin(azimuth)])]
+        [
+            start,
+            start + run_px[:, None] * np.column_stack([elementwise(cos, azimuth), elementwise(sin, azimuth)]),
+        ]
     )
     trapped = _SHIELDED_MEV + rng.exponential(_SPECTRUM_MEV, count)
     charge = _electrons(trapped if energy_mev is None else np.full(count, energy_mev), epi_um / cosine, rng)
@@ -93,8 +97,8 @@ def _electrons(energy_mev: Array, path_um: Array, rng: np.random.Generator) -> n
     """Return electrons freed on paths (n,) through silicon by protons of given energies (n,)."""
     mass_g_cm2 = _DENSITY_G_CM3 * path_um * 1e-4
     mean_mev = stopping_power(energy_mev) * mass_g_cm2
-    beta2 = 1.0 - (1.0 + energy_mev / _PROTON_MEV) ** -2
+    beta2 = 1.0 - 1.0 / square(1.0 + energy_mev / _PROTON_MEV)
     spread_mev = 0.5 * _COUPLING * _CHARGE_PER_MASS * mass_g_cm2 / beta2
-    moyal = -np.log(rng.standard_normal(len(energy_mev)) ** 2)
+    moyal = -elementwise(log, square(rng.standard_normal(len(energy_mev))))
     lost_mev = np.clip(mean_mev + spread_mev * (moyal - _MOYAL_MEAN), 0.1 * mean_mev, energy_mev)
     return lost_mev / _PAIR_MEV

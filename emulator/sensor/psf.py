@@ -8,7 +8,9 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Array32
+from starid.arrays import Array, Array32, elementwise
+from starid.elementary import cos, log, square
+from starid.imaging.normal_table import normal
 from starid.kernels.jit import compiled_ieee, inner
 
 MAX_GAUSS_NODES: Final = 200
@@ -16,9 +18,9 @@ MAX_NODES: Final = 20_000
 MAX_RADIUS_SIGMA: Final = 7.0
 _NODES_PER_SIGMA: Final = 0.85
 _MIN_NODES: Final = 3
+_NEWTON_STEPS: Final = 6
 _STILL_SIGMA: Final = 1e-3
 _CUT_E: Final = 0.01
-_SQRT_HALF: Final = math.sqrt(0.5)
 
 
 @lru_cache(maxsize=64)
@@ -27,8 +29,20 @@ def _rule(count: int) -> tuple[Array, Array]:
     if count > MAX_GAUSS_NODES:
         nodes = np.linspace(-1.0, 1.0, count, endpoint=False, dtype=np.float64) + 1.0 / count
         return nodes, np.full(count, 1.0 / count, dtype=np.float64)
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    return nodes, np.asarray(0.5 * weights, dtype=np.float64)
+    nodes = elementwise(cos, math.pi * (np.arange(count) + 0.75) / (count + 0.5))
+    for _ in range(_NEWTON_STEPS):
+        value, slope = _legendre(nodes, count)
+        nodes = nodes - value / slope
+    _, slope = _legendre(nodes, count)
+    return nodes, 1.0 / ((1.0 - square(nodes)) * square(slope))
+
+
+def _legendre(x: Array, degree: int) -> tuple[Array, Array]:
+    """Return the Legendre polynomial of a degree and its derivative, −1 < x < 1."""
+    before, value = np.ones_like(x), x
+    for k in range(2, degree + 1):
+        before, value = value, ((2.0 * k - 1.0) * x * value - (k - 1.0) * before) / k
+    return value, degree * (before - x * value) / (1.0 - square(x))
 
 
 def path_rule(longest_px: float, sigma_px: float) -> tuple[Array, Array]:
@@ -49,11 +63,11 @@ def path_rule(longest_px: float, sigma_px: float) -> tuple[Array, Array]:
 @inner
 def _bell(edge: float, sigma: float, out: Array, count: int) -> None:
     """Compute the fractions of a Gaussian around 0 in `count` unit cells; the first cell starts at `edge`."""
-    scale = _SQRT_HALF / sigma
-    before = math.erf(edge * scale)
+    scale = 1.0 / sigma
+    before, _ = normal(edge * scale)
     for k in range(count):
-        after = math.erf((edge + k + 1.0) * scale)
-        out[k] = 0.5 * (after - before)
+        after, _ = normal((edge + k + 1.0) * scale)
+        out[k] = after - before
         before = after
 
 
@@ -82,7 +96,7 @@ def add_spots(
         if not total > 0.0:
             continue
         sigma_x, sigma_y = sigma[i, 0], sigma[i, 1]
-        radii = math.sqrt(2.0 * math.log(max(total / _CUT_E, 2.0)))
+        radii = math.sqrt(2.0 * log(max(total / _CUT_E, 2.0)))
         radii = min(radii, MAX_RADIUS_SIGMA)
         for m in range(nodes.size):
             t = nodes[m]

@@ -27,7 +27,10 @@ from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.catalog.catalog import companions
+from starid.catalog.photometry import flux_ratio
 from starid.catalog.variable_stars import BRIGHTEST, HIP, variable_magnitudes
+from starid.elementary import acos, cos, square
+from starid.matrices import length, lengths, product
 
 __all__ = ["Frame", "Renderer", "SensorModel", "StarTruth", "render"]
 
@@ -107,7 +110,7 @@ def _disturbed(
         path = path.copy()
         path[:, :2] += objects.star_position_noise_px * rng.normal(size=(len(path), 2))
     if objects.star_magnitude_noise > 0.0:
-        electrons = electrons * 10.0 ** (-0.4 * objects.star_magnitude_noise * rng.normal(size=len(path)))
+        electrons = electrons * flux_ratio(objects.star_magnitude_noise * rng.normal(size=len(path)))
     return path, electrons
 
 
@@ -160,7 +163,7 @@ class Renderer:
         self._vectors = np.ascontiguousarray(catalog.vectors[self._rows])
         parallax_mas = np.maximum(np.nan_to_num(catalog.parallax_mas[self._rows]), 0.0)
         self._parallax_rad = np.radians(parallax_mas / 3.6e6)
-        self._flux_e_s = self.sensor.zero_magnitude_e_s * 10.0 ** (-0.4 * brightness[self._rows])
+        self._flux_e_s = self.sensor.zero_magnitude_e_s * flux_ratio(brightness[self._rows])
         hip = catalog.hip[self._rows]
         number = np.flatnonzero(np.isin(HIP, hip))
         where = np.array([np.flatnonzero(hip == each)[0] for each in HIP[number]], dtype=np.int64)
@@ -169,7 +172,7 @@ class Renderer:
         self._only_at_maximum = where[(self._varying[2] > limit) & ~np.isin(self._rows[where], near)]
         """Rows of variable stars that are within the limit only at their maximum."""
         self._sky_stars: tuple[tuple[object, ...], Array, Array] = ((), self._vectors, np.ones(0))
-        self._cos_cone = math.cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
+        self._cos_cone = cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
         pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
         self._pattern = _vignetted(pattern, camera, self.sensor.vignetting)
         self._sky_e_s = np.float32(self.sensor.sky_e_s(camera.pixel_scale_rad))
@@ -275,7 +278,7 @@ class Renderer:
         magnitudes = np.concatenate([source.uniform(low, high, count) for count, source in numbers])
         path = np.zeros((len(xy), 6))
         path[:, :2] = xy
-        self._add_light(mean, path, self.sensor.electrons(0.0, exposure_s) * 10.0 ** (-0.4 * magnitudes))
+        self._add_light(mean, path, self.sensor.electrons(0.0, exposure_s) * flux_ratio(magnitudes))
         return xy
 
     def trails(self, frame: Frame) -> Array:
@@ -319,7 +322,7 @@ class Renderer:
             flux_e_s[self._only_at_maximum] = 0.0
         else:
             fainter = variable_magnitudes(observer.unix_s)[number] - in_catalog
-            flux_e_s[rows] *= 10.0 ** (-0.4 * fainter)
+            flux_e_s[rows] *= flux_ratio(fainter)
         return vectors, flux_e_s
 
     def _with_catalog_errors(self, objects: SkyObjects | None) -> tuple[Array, Array]:
@@ -336,7 +339,7 @@ class Renderer:
         if self._sky_stars[0] != errors:
             rng = np.random.default_rng((self.seed, _CATALOG_STREAM))
             vectors, fainter = as_in_the_sky(self.catalog.hip[self._rows], self._vectors, *errors, rng)
-            self._sky_stars = errors, vectors, 10.0 ** (-0.4 * fainter)
+            self._sky_stars = errors, vectors, flux_ratio(fainter)
         return self._sky_stars[1], self._flux_e_s * self._sky_stars[2]
 
     def _paths(
@@ -351,13 +354,13 @@ class Renderer:
     ) -> tuple[Array, Indices, Mask]:
         """Return paths (n, 6), numbers and centre-inside mask of the stars and planets whose light may reach the image.
 
-        The stars are in directions `vectors` (k, 3), those that `shine`. A path is the parabola through the projections at the start, middle and end of the exposure. The numbers of planets
-        follow those of the stars.
+        The stars are in directions `vectors` (k, 3), those that `shine`. A path is the parabola through the projections at the start,
+        middle and end of the exposure. The numbers of planets follow those of the stars.
         """
         readout_s = self.camera.height * self.sensor.row_time_s
-        sweep = float(np.linalg.norm(rate)) * (exposure_s + readout_s)
-        cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
-        near = np.flatnonzero((vectors @ attitude.boresight >= cosine) & shine)
+        sweep = length(rate) * (exposure_s + readout_s)
+        cosine = cos(min(acos(self._cos_cone) + sweep, math.pi))
+        near = np.flatnonzero((product(vectors, attitude.boresight) >= cosine) & shine)
         icrs = vectors[near]
         if observer is not None:
             icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
@@ -408,9 +411,9 @@ class Renderer:
         base = self.sensor.psf_sigma_px
         half = 0.5 * np.array([self.camera.width, self.camera.height])
         off_axis = (path[:, :2] + 0.5 - half) / half
-        width = base * (1.0 + self.sensor.psf_growth * np.sum(off_axis**2, axis=1))
+        width = base * (1.0 + self.sensor.psf_growth * np.sum(square(off_axis), axis=1))
         sigma = np.column_stack([width, width])
-        longest = 2.0 * float(np.max(np.hypot(path[:, 2], path[:, 3]), initial=0.0))
+        longest = 2.0 * float(np.max(lengths(path[:, 2:4]), initial=0.0))
         nodes, weights = path_rule(longest, base)
         add_spots(mean, self._pattern.sensitivity, path, electrons, sigma, nodes, weights)
 
@@ -456,7 +459,7 @@ def _whole_number(name: str, value: int) -> int:
 def _rate(value: npt.ArrayLike) -> Array:
     """Check a body rate."""
     rate = np.asarray(value, dtype=np.float64)
-    if rate.shape != (3,) or not np.all(np.isfinite(rate)) or np.linalg.norm(rate) > _MAX_RATE_RAD_S:
+    if rate.shape != (3,) or not np.all(np.isfinite(rate)) or length(rate) > _MAX_RATE_RAD_S:
         raise EmulatorError(
             f"body rate: must be three numbers of at most {_MAX_RATE_RAD_S} rad/s, not {value!r}"
         )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arrays import Array, elementwise
 from starid.camera import Camera
+from starid.elementary import cos, sin
+from starid.matrices import length, product
 
 _ROUNDS: Final = 3
 """Number of iterations for the row of a star and the time of this row."""
@@ -41,10 +42,11 @@ def turned(vectors: Array, rate_rad_s: Array, times_s: Array) -> Array:
 
     They are rotated as by ``Attitude.rotated(rate * time)``; the body rate (3,) is in the sensor frame.
     """
-    speed = math.sqrt(float(rate_rad_s @ rate_rad_s))
+    speed = length(rate_rad_s)
     axis = rate_rad_s / speed
-    angles = -speed * times_s[:, None]  # the sky turns in the opposite direction to the sensor
-    along = (vectors @ axis)[:, None] * axis
+    angles = -speed * times_s  # the sky turns in the opposite direction to the sensor
+    along = product(vectors, axis)[:, None] * axis
     across = vectors - along
-    result: Array = along + np.cos(angles) * across + np.sin(angles) * np.cross(axis, vectors)
+    cosine, sine = (elementwise(function, angles)[:, None] for function in (cos, sin))
+    result: Array = along + cosine * across + sine * np.cross(axis, vectors)
     return result

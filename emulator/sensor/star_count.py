@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from starhil.emulator.sensor.model import SensorModel
+from starid.elementary import power
 
 STARS_TO_V6: Final = 5000.0
 """Stars in the whole sky to V = 6; their number grows by a factor 10 ** 0.5 per magnitude."""
@@ -17,7 +18,7 @@ FEW_STARS: Final = 8.0
 def mean_stars(camera: Mapping[str, Any], faintest_v: float) -> float:
     """Return the mean number of stars in a field down to a magnitude; `camera` has the fields of a `starid.camera.Camera`."""
     share: float = camera["width"] * camera["height"] / math.prod(camera["focal_px"]) / (4.0 * math.pi)
-    return STARS_TO_V6 * math.pow(10.0, 0.5 * (faintest_v - 6.0)) * min(share, 1.0)
+    return STARS_TO_V6 * power(10.0, 0.5 * (faintest_v - 6.0)) * min(share, 1.0)
 
 
 def few_stars(camera: Mapping[str, Any], sensor: SensorModel, settings: Mapping[str, Any]) -> str:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from concurrent.futures import Executor, Future
 from functools import partial
-from typing import Any, Final, ParamSpec, TypeVar
+from typing import Any, Final, ParamSpec, TypeVar, TypeVarTuple
 
 Arguments = ParamSpec("Arguments")
 Result = TypeVar("Result")
+Each = TypeVarTuple("Each")
 
 SWITCH_S: Final = 0.0002
 """Time for which a thread may keep the interpreter while another waits for it, seconds. The event loop waits for it several
@@ -51,6 +52,22 @@ async def in_thread(
     call: Any = partial(function, *args, **kwargs)
     result: Result = await asyncio.get_running_loop().run_in_executor(_THREADS, call)
     return result
+
+
+class _Loop(asyncio.SelectorEventLoop):
+    """An event loop whose slow calls are abandoned at its end: name servers and drivers may never answer."""
+
+    def run_in_executor(
+        self, executor: Executor | None, func: Callable[[*Each], Result], *args: *Each
+    ) -> asyncio.Future[Result]:
+        """Call a function in a thread, by default in one that nobody waits for."""
+        return super().run_in_executor(_THREADS if executor is None else executor, func, *args)
+
+
+def run_loop(main: Coroutine[Any, Any, Result]) -> Result:
+    """Run a coroutine, as `asyncio.run` does, and end when it has ended."""
+    with asyncio.Runner(loop_factory=_Loop) as runner:
+        return runner.run(main)
 
 
 def share_interpreter() -> None:

@@ -39,6 +39,7 @@ from starhil.emulator.truth.table import FileTruth, OrbitTable
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.arrays import Array
 from starid.attitude import Attitude
+from starid.matrices import lengths
 from starid.storage.files import read_number
 
 if TYPE_CHECKING:
@@ -183,7 +184,7 @@ def _attitudes(where: str, segment: Segment) -> list[Row]:
     if kind.startswith("QUATERNION"):
         scalar_first = _choice(where, segment, "QUATERNION_TYPE", "LAST", "FIRST")
         quaternions, values = np.roll(values[:, :4], -1 if scalar_first else 0, axis=1), values[:, 4:]
-        if not (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= NORM_TOLERANCE).all():
+        if not (np.abs(lengths(quaternions) - 1.0) <= NORM_TOLERANCE).all():
             raise EmulatorError(f"{where}: a quaternion is not of length 1")
         turns = Rotation.from_quat(quaternions)
     else:

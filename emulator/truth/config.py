@@ -32,6 +32,8 @@ from starhil.emulator.truth.source import (
     TruthSource,
 )
 from starid.attitude import Attitude
+from starid.attitude.wahba import solve_wahba
+from starid.matrices import dot, length, product
 
 AxisRate: TypeAlias = Annotated[float, Field(ge=-MAX_RATE_DEG_S, le=MAX_RATE_DEG_S)]
 Rate: TypeAlias = Annotated[list[AxisRate], Field(min_length=3, max_length=3)]
@@ -88,7 +90,7 @@ class AttitudeConfig(Strict):
         if self.quaternion_xyzw is not None:
             if any(angle is not None for angle in angles):
                 raise ValueError("give ra_deg, dec_deg, roll_deg or quaternion_xyzw, not both")
-            if abs(math.hypot(*self.quaternion_xyzw) - 1.0) > 0.01:
+            if abs(length(np.array(self.quaternion_xyzw)) - 1.0) > 0.01:
                 raise ValueError("quaternion_xyzw is not of length 1")
         elif self.ra_deg is None or self.dec_deg is None:
             raise ValueError("give ra_deg and dec_deg (roll_deg defaults to 0), or quaternion_xyzw")
@@ -129,11 +131,14 @@ class MountConfig(Strict):
         forms = (self.quaternion_xyzw, self.matrix, self.euler_deg)
         if sum(form is not None for form in forms) != 1:
             raise ValueError("give one of quaternion_xyzw, matrix and euler_deg")
-        if self.quaternion_xyzw is not None and abs(math.hypot(*self.quaternion_xyzw) - 1.0) > 0.01:
+        if self.quaternion_xyzw is not None and abs(length(np.array(self.quaternion_xyzw)) - 1.0) > 0.01:
             raise ValueError("quaternion_xyzw is not of length 1")
         if self.matrix is not None:
             axes = np.array(self.matrix)
-            if np.abs(axes @ axes.T - np.eye(3)).max() > ORTHONORMAL or np.linalg.det(axes) < 0.0:
+            if (
+                np.abs(product(axes, axes.T) - np.eye(3)).max() > ORTHONORMAL
+                or dot(np.cross(axes[0], axes[1]), axes[2]) < 0.0
+            ):
                 raise ValueError("matrix is not a rotation; its rows must be orthonormal and right-handed")
         if any(one == other for one, other in pairwise(self.sequence)):
             raise ValueError(f"sequence {self.sequence} turns about one axis twice in a row")
@@ -144,8 +149,7 @@ class MountConfig(Strict):
         if self.quaternion_xyzw is not None:
             return Attitude(np.array(self.quaternion_xyzw))
         if self.matrix is not None:
-            left, _, right = np.linalg.svd(np.array(self.matrix))
-            return Attitude.from_matrix(left @ right)
+            return solve_wahba(np.array(self.matrix).T, np.eye(3))
         rotation = Attitude.identity()
         for axis, angle in zip(self.sequence, self.euler_deg or (), strict=True):
             turn = np.zeros(3)

@@ -35,6 +35,7 @@ from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import MAX_RATE_DEG_S, Vector
 from starid.attitude import Attitude
 from starid.catalog.earth import LATEST_UNIX_S
+from starid.matrices import length
 
 NORM_TOLERANCE: Final = 0.01
 """Largest error of the length of a quaternion that is attributed to rounding."""
@@ -107,7 +108,7 @@ class JsonFormat:
 
 def checked_attitude(key: str, quaternion_xyzw: Vector, convention: Convention) -> Attitude:
     """Return the attitude of a scalar-last quaternion (4,); FeedError if it is not of length 1."""
-    if not abs(float(np.linalg.norm(quaternion_xyzw)) - 1.0) <= NORM_TOLERANCE:
+    if not abs(length(np.array(quaternion_xyzw)) - 1.0) <= NORM_TOLERANCE:
         raise FeedError(f"{key} is not of length 1")
     if convention == "attitude":
         quaternion_xyzw = quaternion_xyzw * [-1.0, -1.0, -1.0, 1.0]

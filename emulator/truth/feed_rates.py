@@ -17,6 +17,7 @@ import numpy as np
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, Vector
 from starid.attitude import Attitude, rate_between
+from starid.matrices import length
 
 SHORTEST_S: Final = 1e-9
 """Shortest time between two messages, seconds: the resolution of simulation time."""
@@ -112,10 +113,10 @@ class FeedRates:
             return
         step_s = max(message.at_s - before.at_s, SHORTEST_S)
         self._expected = self._expected + 0.5 * step_s * (before.rate_rad_s + rate)
-        self._change_rad += 0.5 * step_s * float(np.linalg.norm(rate - before.rate_rad_s))
+        self._change_rad += 0.5 * step_s * length(rate - before.rate_rad_s)
         elapsed_s = message.at_s - self._reference.at_s
         turned = rate_between(self._reference.attitude, message.attitude, 1.0)
-        size = max(float(np.linalg.norm(turned)), float(np.linalg.norm(self._expected)))
+        size = max(length(turned), length(self._expected))
         repeated = np.array_equal(before.attitude.quaternion_xyzw, message.attitude.quaternion_xyzw)
         conclusive = size >= CONCLUSIVE_RAD and not repeated
         if conclusive or elapsed_s >= PATIENCE_S:
@@ -132,14 +133,14 @@ class FeedRates:
 
     def _disagree(self, turned: Vector) -> bool:
         """Return whether the rotation since the reference contradicts the received rates."""
-        length, expected = float(np.linalg.norm(turned)), float(np.linalg.norm(self._expected))
-        if max(length, expected) > AMBIGUOUS_RAD:
+        seen, expected = length(turned), length(self._expected)
+        if max(seen, expected) > AMBIGUOUS_RAD:
             return False
-        factor = length / expected if expected > 0.0 else 1.0
+        factor = seen / expected if expected > 0.0 else 1.0
         if self.timed:
             factor = min(max(factor, 1.0 / TIME_FACTOR), TIME_FACTOR)
         allowed = NOISE_RAD + factor * (self._change_rad + DIRECTION_TOLERANCE * expected)
-        return float(np.linalg.norm(turned - factor * self._expected)) > allowed
+        return length(turned - factor * self._expected) > allowed
 
     def _set_reference(self, message: _Message) -> None:
         self._reference = message

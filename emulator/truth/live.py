@@ -9,9 +9,9 @@ The first message (or the last one before time starts) sets the offset between t
 ``t`` is simulation time. A sender that runs at another speed than the clock is reported, and flagged ``wrong_speed``;
 each of its messages then holds from its receipt, with ``timeline = "run"`` still at its ``t``.
 
-Between two messages the attitude is interpolated, with the rates of both if the sender gives rates and times. After the last one it is propagated at the last rate for at most
-``stale_s``; then it is held and flagged ``stale``. With ``timeline = "run"`` it is also stale if the last ``t`` is
-older than this.
+Between two messages the attitude is interpolated, with the rates of both if the sender gives rates and times. After the
+last one it is propagated at the last rate for at most ``stale_s``; then it is held and flagged ``stale``. With
+``timeline = "run"`` it is also stale if the last ``t`` is older than this.
 
 A position, velocity or date that cannot be right (`starhil.emulator.truth.plausibility`) is used as it was sent, but
 reported with the likely mistake, and the truth is flagged ``implausible``.

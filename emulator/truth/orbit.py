@@ -13,8 +13,10 @@ from typing import Any, Final, Protocol, Self, TypeAlias
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
-from starid.arrays import Array
-from starid.catalog.earth import DAY_S, UNIX_EPOCH_JD, terrestrial_time
+from starid.arrays import Array, on_grid
+from starid.catalog.earth import DAY_S, UNIX_EPOCH_JD, VELOCITY_GRID_M_S, terrestrial_time
+from starid.elementary import acos, atan2, cos, hypot, sin, square
+from starid.matrices import dot, length, product
 
 Vector: TypeAlias = Array
 
@@ -25,6 +27,7 @@ EARTH_J2: Final = 1.082_626_68e-3
 LARGEST_ECCENTRICITY: Final = 0.995
 TLE_LENGTH: Final = 69
 _KEPLER_STEPS: Final = 60
+_POSITION_GRID_M: Final = 2.0**-10
 
 
 @dataclass(frozen=True)
@@ -73,32 +76,32 @@ class KeplerOrbit:
     def from_state(cls, epoch_unix_s: float, state: OrbitState, *, j2: bool = True) -> Self:
         """Return the orbit with a position and velocity (osculating elements)."""
         r, v = state.position_m, state.velocity_m_s
-        distance, speed2 = float(np.linalg.norm(r)), float(v @ v)
+        distance, speed2 = length(r), dot(v, v)
         momentum = np.cross(r, v)
-        area = float(np.linalg.norm(momentum))
+        area = length(momentum)
         if not (distance > 0.0 and area > 0.0 and 2.0 / distance > speed2 / EARTH_GM_M3_S2):
             raise EmulatorError(
                 "orbit: position and velocity are not on an ellipse about the Earth; give metres and m/s, GCRS"
             )
         a = 1.0 / (2.0 / distance - speed2 / EARTH_GM_M3_S2)
         h = momentum / area
-        raan = math.atan2(h[0], -h[1]) if math.hypot(h[0], h[1]) > 1e-12 else 0.0
-        node = np.array([math.cos(raan), math.sin(raan), 0.0])
+        raan = atan2(h[0], -h[1]) if hypot(h[0], h[1]) > 1e-12 else 0.0
+        node = np.array([cos(raan), sin(raan), 0.0])
         towards = np.cross(v, momentum) / EARTH_GM_M3_S2 - r / distance
-        e = float(np.linalg.norm(towards))
+        e = length(towards)
         perigee = _angle_about(h, node, towards) if e > 1e-9 else 0.0
         true = _angle_about(h, node, r) - perigee
-        eccentric = 2.0 * math.atan2(
-            math.sqrt(1.0 - min(e, 1.0)) * math.sin(0.5 * true), math.sqrt(1.0 + e) * math.cos(0.5 * true)
+        eccentric = 2.0 * atan2(
+            math.sqrt(1.0 - min(e, 1.0)) * sin(0.5 * true), math.sqrt(1.0 + e) * cos(0.5 * true)
         )
         return cls(
             epoch_unix_s,
             a,
             e,
-            math.acos(max(-1.0, min(1.0, float(h[2])))),
+            acos(max(-1.0, min(1.0, float(h[2])))),
             raan,
             perigee,
-            eccentric - e * math.sin(eccentric),
+            eccentric - e * sin(eccentric),
             j2,
         )
 
@@ -106,18 +109,18 @@ class KeplerOrbit:
         """Return position and velocity at a Unix time."""
         a, e = self.semi_major_axis_m, self.eccentricity
         elapsed_s = unix_s - self.epoch_unix_s
-        motion = math.sqrt(EARTH_GM_M3_S2 / a**3)
+        motion = math.sqrt(EARTH_GM_M3_S2 / (a * a * a))
         root = math.sqrt(1.0 - e * e)
         node_rate = perigee_rate = anomaly_rate = 0.0
         if self.j2:
-            factor = 1.5 * EARTH_J2 * motion * (EARTH_RADIUS_M / (a * (1.0 - e * e))) ** 2
-            cosine2 = math.cos(self.inclination_rad) ** 2
-            node_rate = -factor * math.cos(self.inclination_rad)
+            factor = 1.5 * EARTH_J2 * motion * square(EARTH_RADIUS_M / (a * (1.0 - e * e)))
+            cosine2 = square(cos(self.inclination_rad))
+            node_rate = -factor * cos(self.inclination_rad)
             perigee_rate = 0.5 * factor * (5.0 * cosine2 - 1.0)
             anomaly_rate = 0.5 * factor * root * (3.0 * cosine2 - 1.0)
         mean = self.mean_anomaly_rad + (motion + anomaly_rate) * elapsed_s
         eccentric = _eccentric_anomaly(mean, e)
-        cosine, sine = math.cos(eccentric), math.sin(eccentric)
+        cosine, sine = cos(eccentric), sin(eccentric)
         speed = motion * a / (1.0 - e * cosine)
         in_plane = _orbit_axes(
             self.raan_rad + node_rate * elapsed_s,
@@ -125,8 +128,8 @@ class KeplerOrbit:
             self.argument_of_perigee_rad + perigee_rate * elapsed_s,
         )
         return OrbitState(
-            np.array([a * (cosine - e), a * root * sine]) @ in_plane,
-            np.array([-speed * sine, speed * root * cosine]) @ in_plane,
+            product(np.array([a * (cosine - e), a * root * sine]), in_plane),
+            product(np.array([-speed * sine, speed * root * cosine]), in_plane),
         )
 
 
@@ -163,9 +166,10 @@ class TleOrbit:
             )
         tt = terrestrial_time(unix_s)
         equinoxes = float(erfa.ee00b(*tt))
-        c, s = math.cos(equinoxes), math.sin(equinoxes)
-        to_gcrs = erfa.pnm00b(*tt).T @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        return OrbitState(to_gcrs @ (1e3 * np.array(position_km)), to_gcrs @ (1e3 * np.array(velocity_km_s)))
+        c, s = cos(equinoxes), sin(equinoxes)
+        to_gcrs = product(erfa.pnm00b(*tt).T, np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
+        position, velocity = (product(to_gcrs, 1e3 * np.array(each)) for each in (position_km, velocity_km_s))
+        return OrbitState(on_grid(position, _POSITION_GRID_M), on_grid(velocity, VELOCITY_GRID_M_S))
 
 
 def interpolate_orbit(before: OrbitState, after: OrbitState, fraction: float, span_s: float) -> OrbitState:
@@ -185,7 +189,7 @@ def _eccentric_anomaly(mean: float, e: float) -> float:
     mean = math.remainder(mean, 2.0 * math.pi)
     eccentric = mean if e < 0.8 else math.copysign(math.pi, mean)
     for _ in range(_KEPLER_STEPS):
-        step = (eccentric - e * math.sin(eccentric) - mean) / (1.0 - e * math.cos(eccentric))
+        step = (eccentric - e * sin(eccentric) - mean) / (1.0 - e * cos(eccentric))
         eccentric -= step
         if abs(step) < 1e-14:
             break
@@ -194,9 +198,9 @@ def _eccentric_anomaly(mean: float, e: float) -> float:
 
 def _orbit_axes(raan: float, inclination: float, perigee: float) -> Vector:
     """Return unit vectors (2, 3) in the orbital plane: to the perigee, and 90° ahead of it."""
-    co, so = math.cos(raan), math.sin(raan)
-    ci, si = math.cos(inclination), math.sin(inclination)
-    cw, sw = math.cos(perigee), math.sin(perigee)
+    co, so = cos(raan), sin(raan)
+    ci, si = cos(inclination), sin(inclination)
+    cw, sw = cos(perigee), sin(perigee)
     return np.array(
         [
             [co * cw - so * sw * ci, so * cw + co * sw * ci, sw * si],
@@ -207,7 +211,7 @@ def _orbit_axes(raan: float, inclination: float, perigee: float) -> Vector:
 
 def _angle_about(axis: Vector, origin: Vector, direction: Vector) -> float:
     """Return the angle from one direction to another about an axis perpendicular to both, radians."""
-    return math.atan2(float(axis @ np.cross(origin, direction)), float(origin @ direction))
+    return atan2(dot(axis, np.cross(origin, direction)), dot(origin, direction))
 
 
 def _sgp4_error(code: int) -> str:

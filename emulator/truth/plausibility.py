@@ -15,6 +15,8 @@ from typing import Final
 
 from starhil.emulator.truth.orbit import EARTH_GM_M3_S2, OrbitState
 from starid.catalog.earth import DAY_S
+from starid.elementary import square
+from starid.matrices import length
 
 SURFACE_M: Final = 6.35e6
 """Distance from the Earth's centre below which nothing flies: the poles are at 6357 km."""
@@ -48,7 +50,7 @@ EPOCHS: Final = {
 
 def doubt_of_orbit(orbit: OrbitState) -> str:
     """Return why position and velocity cannot be right, with the likely mistake; an empty text if they can."""
-    distance, speed = (math.hypot(*vector) for vector in (orbit.position_m, orbit.velocity_m_s))
+    distance, speed = (length(vector) for vector in (orbit.position_m, orbit.velocity_m_s))
     fault = _fault(distance, speed)
     if not fault:
         return ""
@@ -75,7 +77,7 @@ def _fault(distance_m: float, speed_m_s: float) -> str:
         return "the position is inside the Earth"
     squared = EARTH_GM_M3_S2 / distance_m
     near = distance_m < NEAR_EARTH_M
-    if speed_m_s > (math.sqrt(2.0 * squared + EXCESS_M_S**2) if near else FASTEST_M_S):
+    if speed_m_s > (math.sqrt(2.0 * squared + square(EXCESS_M_S)) if near else FASTEST_M_S):
         return "the velocity is that of no spacecraft"
     if near and distance_m > ATMOSPHERE_M and speed_m_s < LEAST_CIRCULAR_SHARE * math.sqrt(squared):
         return "the velocity is far below that of an orbit at this distance"

@@ -4,7 +4,8 @@ Whoever makes such a file decides how long it takes to read, how much memory tha
 does with it. Here none of this delays a reply, keeps the run from its end, or ends it: the process has half of the
 machine's memory, and ends with the one that has started it.
 
-It writes one line of JSON, either the problems, or what is not an array and the number of arrays; and then the arrays, as `numpy.save` does.
+It writes one line of JSON, either the problems, or what is not an array and the number of arrays; and then the arrays,
+as `numpy.save` does.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from dataclasses import astuple
 from pathlib import Path
@@ -29,12 +31,16 @@ from starhil.emulator.simulation.parent_death_signal import end_with_parent
 from starhil.emulator.truth.file import read_orbit_file, read_truth_file
 from starhil.emulator.truth.spice_file import META_KERNEL
 from starhil.emulator.truth.table import Attitudes, FileTruth, Orbits, OrbitTable, Span
+from starhil.protocol.files.user_file import open_user_file
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.truth")
 
 AT_ONCE_BYTES: Final = 500_000
 """Size up to which a text is read in the process of the run, which takes a thread of it half a second."""
+
+LONGEST_S: Final = 900
+"""Longest time for which a file is read, seconds: a meta-kernel may name a pipe, and truths wait for one another."""
 
 Kind: TypeAlias = Literal["truth", "orbit"]
 
@@ -73,10 +79,8 @@ def _is_small_text(path: Path) -> bool:
 
 
 def _begins_as_kernel(path: Path) -> bool:
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return META_KERNEL.encode() in file.read(2 * len(META_KERNEL))
+    with open_user_file(path) as file:
+        return META_KERNEL.encode() in (file.read(2 * len(META_KERNEL)) or b"")
 
 
 def _spans(content: dict[str, Any]) -> list[Span]:
@@ -89,6 +93,9 @@ def _read_apart(kind: Kind, path: Path) -> tuple[dict[str, Any], list[Any]]:
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as process:  # noqa: S603
         if process.stdout is None:
             raise RuntimeError("no pipe")
+        limit = threading.Timer(LONGEST_S, process.kill)
+        limit.daemon = True
+        limit.start()
         try:
             content = json.loads(process.stdout.readline())
             if "problems" not in content:
@@ -103,12 +110,15 @@ def _read_apart(kind: Kind, path: Path) -> tuple[dict[str, Any], list[Any]]:
         except ValueError:  # it has ended before the end
             content = None
         finally:
+            too_late = limit.finished.is_set()
+            limit.cancel()
             process.kill()
     if content is not None:
         raise EmulatorError(*content["problems"])
     code = process.returncode
     how = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
-    raise EmulatorError(f"{kind} file {path}: cannot be read (the process that reads it has ended {how})")
+    why = f"it takes longer than {LONGEST_S} s" if too_late else f"the process that reads it has ended {how}"
+    raise EmulatorError(f"{kind} file {path}: cannot be read ({why})")
 
 
 # --- the other process ---

@@ -19,6 +19,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.orbit import Orbit, OrbitState
 from starid.arrays import Array
 from starid.attitude import Attitude, propagate
+from starid.elementary import square
+from starid.matrices import length
 
 Vector: TypeAlias = Array
 
@@ -176,8 +178,8 @@ def _slew_angle_and_rate(
         return angle, 0.0
     if segment.shape == "smooth":
         tau = elapsed / seconds
-        turned = angle * tau**3 * (10.0 - 15.0 * tau + 6.0 * tau * tau)
-        return turned, angle / seconds * 30.0 * tau**2 * (1.0 - tau) ** 2
+        turned = angle * tau * square(tau) * (10.0 - 15.0 * tau + 6.0 * tau * tau)
+        return turned, angle / seconds * 30.0 * square(tau) * square(1.0 - tau)
     a = segment.acceleration_rad_s2
     ramp = min(segment.rate_rad_s / a, 0.5 * seconds)
     if elapsed < ramp:
@@ -208,7 +210,7 @@ class SlewTruth:
         for segment in segments:
             if isinstance(segment, SlewSegment):
                 rotation = segment.to.error_to(current).rotation_vector_rad
-                angle = float(np.linalg.norm(rotation))
+                angle = length(rotation)
                 axis = rotation / angle if angle > 0.0 else np.array([0.0, 0.0, 1.0])
                 leg = _Leg(leg_start_s, _slew_seconds(segment, angle), current, axis, angle, segment)
                 current = segment.to

@@ -26,6 +26,7 @@ from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starhil.emulator.truth.table import FileTruth
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.attitude import Attitude
+from starid.matrices import product
 
 
 @dataclass(frozen=True)
@@ -175,8 +176,8 @@ def seen_from(mount: Attitude | None, body: TruthState) -> TruthState:
     turn = mount.matrix
     return replace(
         body,
-        attitude=Attitude.from_matrix(turn @ body.attitude.matrix),
-        rate_rad_s=turn @ body.rate_rad_s,
+        attitude=Attitude.from_matrix(product(turn, body.attitude.matrix)),
+        rate_rad_s=product(turn, body.rate_rad_s),
     )
 
 

@@ -1,6 +1,7 @@
 """Forms in which a row reports the attitude, read as directions of the sensor's axes in ICRS.
 
-    quaternion · vector part · rotation vector · Euler angles · a row of the matrix · RA, Dec, roll · RA, Dec
+    quaternion · vector part · rotation vector · Gibbs vector · modified Rodrigues parameters
+            Euler angles · a row of the matrix · RA, Dec, roll · RA, Dec
                                         ▼
                      sensor axis (0, 1, 2) → unit vector in ICRS
 
@@ -20,6 +21,8 @@ from starhil.hil_tests.attitude import (
     Quaternion,
     Vector,
     conjugate,
+    from_gibbs_vector,
+    from_modified_rodrigues,
     from_radec_roll,
     from_reported,
     from_rotation_vector,
@@ -47,13 +50,14 @@ class Form:
     """Quantities that together state an attitude.
 
     `read` converts their values, angles in rad, to sensor axes. `lengths`, if given, are the shortest and longest vector that the
-    values may make.
+    values may make. `turn_rad` is the largest turn of the attitude by an error of 1 in all values.
     """
 
     name: str
     quantities: tuple[str, ...]
     read: Callable[[Sequence[float], Conventions], Axes]
     lengths: tuple[float, float] | None = None
+    turn_rad: float = 4.0
 
     @property
     def has_inverse(self) -> bool:
@@ -71,8 +75,10 @@ def _quaternion(parts: Sequence[float], conventions: Conventions) -> Axes:
     return axes_of(from_reported(attitude, conventions))
 
 
-def _rotation_vector(vector: Sequence[float], conventions: Conventions) -> Axes:
-    return _quaternion(from_rotation_vector(vector), conventions)
+def _vector(
+    rotation: Callable[[Sequence[float]], Quaternion],
+) -> Callable[[Sequence[float], Conventions], Axes]:
+    return lambda vector, conventions: _quaternion(rotation(vector), conventions)
 
 
 def _euler(sequence: str) -> Callable[[Sequence[float], Conventions], Axes]:
@@ -112,7 +118,9 @@ VECTOR_PART: Final = Form("vector part", _of("", "xyz"), _quaternion, (0.0, 1.0)
 FORMS: Final = (
     QUATERNION,
     VECTOR_PART,
-    Form("rotation vector", _of("rotation_", "xyz"), _rotation_vector, (0.0, math.pi)),
+    Form("rotation vector", _of("rotation_", "xyz"), _vector(from_rotation_vector), (0.0, math.pi)),
+    Form("Gibbs vector", _of("gibbs_", "xyz"), _vector(from_gibbs_vector)),
+    Form("modified Rodrigues parameters", _of("mrp_", "xyz"), _vector(from_modified_rodrigues), (0.0, 1.0), 7.0),
     *(Form("matrix row", _of(f"dcm_{axis}", AXES_FROM_1), _matrix_row(number), (1.0, 1.0)) for number, axis in enumerate("xyz")),
     *(
         Form("Euler angles", _of(f"euler_{one}{two}{last}", AXES_FROM_1), _euler(one + two + last))
@@ -145,7 +153,7 @@ class Reading:
     @property
     def rounding_deg(self) -> float:
         """Largest error of the attitude by the rounding of the values; largest where the scalar part is left out, and 0."""
-        angle = 4.0 * self._rounding
+        angle = self.form.turn_rad * self._rounding
         return math.degrees(2.0 * math.sqrt(angle) if self.form is VECTOR_PART else angle)
 
     def axes(self, seen: Mapping[str, Value], conventions: Conventions) -> Axes:

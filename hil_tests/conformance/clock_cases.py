@@ -6,7 +6,8 @@
     a time   advances by t3 - t2 to t4 - t1, to the resolution of its field and `DRIFT`
     a count  advances by what was sent, a count of frames with time
 
-The clocks of unit and tester need not agree: only elapsed times are compared. Source: docs/quantities.md, which says what each quantity counts.
+The clocks of unit and tester need not agree: only elapsed times are compared. Source: docs/quantities.md, which says
+what each quantity counts.
 """
 
 from __future__ import annotations

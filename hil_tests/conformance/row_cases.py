@@ -66,8 +66,9 @@ def row_cases(
 ) -> Iterator[Case[LinkProbe]]:
     """Yield the cases for the rows of a unit.
 
-    `lengths`: whether a message of a wrong length can be sent on the link. `numbers`: whether requests carry IDs. `marks`: bytes that are special on it, of which settings
-    are made. `highest_id`: the highest that a message can carry. `sizes`: the numbers of bytes of data that a request of a class can have.
+    `lengths`: whether a message of a wrong length can be sent on the link. `numbers`: whether requests carry IDs.
+    `marks`: bytes that are special on it, of which settings are made. `highest_id`: the highest that a message can
+    carry. `sizes`: the numbers of bytes of data that a request of a class can have.
     """
     if numbers:
         yield from _identifiers(unit, highest_id, sizes)
@@ -321,9 +322,13 @@ def _set_and_read(command: Row, row: Row, places: Mapping[str, str], marks: byte
     tried = {name: list(_tried(command.named[name], before[name], marks, rng)) for name in places}
     if command.action == "set_parameters":
         attempts = [
-            (f"{command.name}.{name}", [before | {name: value} for value in values], 1 if command.named[name].parameter in CONSTRAINED_PARAMETERS else 2)
+            (
+                f"{command.name}.{name}",
+                [before | {name: value} for value in values],
+                1 if command.named[name].parameter in CONSTRAINED_PARAMETERS else 2,
+            )
             for name, values in tried.items()
-        ]  # fmt: skip
+        ]
     else:
         turns = range(max(map(len, tried.values())))
         whole = [{name: values[turn % len(values)] for name, values in tried.items()} for turn in turns]

@@ -69,22 +69,23 @@ def select_cases(
 ) -> list[Case[Any]]:
     """Return the cases whose ID matches a pattern with `*` and `?`, or begins with a plain name.
 
-    Raises BenchError: a pattern matches no case, or nothing is left.
+    Raises BenchError: a pattern matches no case, or none of its cases is left.
     """
-    selection = list(cases)
-    if patterns:
-        for pattern in patterns:
-            if not any(_matches(item.id, pattern) for item in selection):
-                areas = ", ".join(sorted({item.area for item in selection}))
-                raise BenchError(f"no conformance case matches '{pattern}'; areas: {areas}")
-        selection = [item for item in selection if any(_matches(item.id, pattern) for pattern in patterns)]
-    if safe_only:
-        intrusive, selection = len(selection), [item for item in selection if not item.intrusive]
-        if not selection:
+    known = list(cases)
+    selected: set[str] = set()
+    for pattern in patterns or ("*",):
+        found = [item for item in known if _matches(item.id, pattern)]
+        if not found:
+            areas = ", ".join(sorted({item.area for item in known}))
+            raise BenchError(f"no conformance case matches '{pattern}'; areas: {areas}")
+        safe = [item for item in found if not item.intrusive]
+        if safe_only and not safe:
             raise BenchError(
-                f"no conformance case is left: --safe-only leaves out all {intrusive}, which change the device"
+                f"no conformance case that matches '{pattern}' is left: --safe-only leaves out all {len(found)}, which change "
+                "the device"
             )
-    return selection
+        selected.update(item.id for item in (safe if safe_only else found))
+    return [item for item in known if item.id in selected]
 
 
 def _matches(case_id: str, pattern: str) -> bool:

@@ -86,9 +86,10 @@ class Motion:
 class AttitudeJudge:
     """Judges attitudes, reported in `conventions`, by the motion of the sensor and the parameters in use.
 
-    `values` are these parameters, which the oracle keeps up to date; `sigma_arcsec` are the largest standard deviations across and about the boresight that the unit may leave unstated; `count` valid
-    attitudes were compared with the truth, which follows the `motions` in the order of their start; no light has reached the
-    detector since `dark_since_s`, None: it does.
+    `values` are these parameters, which the oracle keeps up to date; `sigma_arcsec` are the largest standard deviations
+    across and about the boresight that the unit may leave unstated; `count` valid attitudes were compared with the
+    truth, which follows the `motions` in the order of their start; no light has reached the detector since
+    `dark_since_s`, None: it does.
     """
 
     def __init__(

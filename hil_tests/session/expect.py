@@ -23,9 +23,9 @@ from starhil.hil_tests.attitude import (
     AttitudeDifference,
     Quaternion,
     attitude_error,
+    attitude_in,
     from_radec_roll,
     from_reported,
-    from_vector_part,
     to_radec_roll,
     unit,
 )
@@ -238,11 +238,11 @@ class AttitudeCheck(StatedAttitude):
         return self
 
     def judge(
-        self, values: Mapping[str, Value], truth: Quaternion, conventions: Conventions
+        self, row: Row, values: Mapping[str, Value], truth: Quaternion, conventions: Conventions
     ) -> tuple[AttitudeDifference | None, str | None]:
-        """Return the error of the attitude in telemetry `values` of a unit with these conventions, and the problem or None."""
+        """Return the error of the attitude in the values of a row, and the problem or None."""
         try:
-            measured = from_reported(measured_attitude(values), conventions)
+            measured = from_reported(attitude_in(row, values), conventions)
         except BenchError as refusal:
             return None, str(refusal)
         error = attitude_error(measured, truth)
@@ -268,19 +268,6 @@ def describe(attitude: Quaternion) -> str:
     """Format an attitude."""
     ra_deg, dec_deg, roll_deg = to_radec_roll(attitude)
     return f"RA {ra_deg:.4f}, Dec {dec_deg:.4f}, roll {roll_deg:.4f} deg"
-
-
-def measured_attitude(values: Mapping[str, Value]) -> Quaternion:
-    """Return the attitude in a telemetry row that has q_x, q_y, q_z and optionally q_w.
-
-    Raises BenchError: the attitude in the row is flagged invalid, or there is none.
-    """
-    if values.get("valid") is False:
-        raise BenchError(f"the attitude is not valid (reason {show(values.get('reason', '?'))})")
-    parts = [float(values[key]) for key in ("q_x", "q_y", "q_z")]
-    if "q_w" in values:
-        return unit([*parts, float(values["q_w"])])
-    return from_vector_part(*parts)
 
 
 def unknown_fields(key: str, row: Row, names: Iterable[str]) -> Iterator[str]:

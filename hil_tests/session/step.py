@@ -14,7 +14,7 @@ from typing import Annotated, Any, ClassVar, Final, Protocol, Self, TypeVar
 
 from pydantic import Field, ValidationInfo, model_validator
 
-from starhil.hil_tests.attitude import Quaternion
+from starhil.hil_tests.attitude import Quaternion, attitude_fields
 from starhil.hil_tests.client.transactions import Ack, Reading
 from starhil.hil_tests.errors import BenchError, NackError
 from starhil.hil_tests.rig.rig import Rig
@@ -32,7 +32,6 @@ from starhil.hil_tests.session.step_keys import Count, Duration, Link, Refusal, 
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.values import Value
 
-ATTITUDE_FIELDS: Final = frozenset({"q_x", "q_y", "q_z"})
 MS_PER_S: Final = 1e3
 
 Answer = TypeVar("Answer", Ack, Reading)
@@ -149,8 +148,8 @@ class Step(Keys):
                 if getattr(self, key)
             )
         if self.attitude is not None:
-            if row is None or not row.named_fields.keys() >= ATTITUDE_FIELDS:
-                yield "'attitude' needs a step that reads a row with a quaternion (attitude, quaternion)"
+            if row is None or attitude_fields(row) is None:
+                yield "'attitude' needs a step that reads a row with a quaternion, Gibbs vector, MRPs or rotation vector"
             elif self.attitude.attitude is None and not (info.context or {})["has_truth"]:
                 yield "'attitude' has no truth to compare with: give one here or in a table [truth]"
         if row is not None:
@@ -174,9 +173,11 @@ class Step(Keys):
         ]
         if self.expect and not problems:
             attempt.detail = " ".join(f"{name}={show(reading[name])}" for name in self.expect)
-        if self.attitude is not None and not problems:
+        if self.attitude is not None and self.reading is not None and not problems:
             truth = self.attitude.attitude or session.truth_of(reading)
-            error, problem = self.attitude.judge(reading.values, truth, session.rig.icd.conventions)
+            error, problem = self.attitude.judge(
+                self.reading, reading.values, truth, session.rig.icd.conventions
+            )
             if error is not None:
                 attempt.figures.update(vars(error))
                 attempt.detail += f" error: {show_angle(error.cross_boresight_arcsec)} cross, {show_angle(error.roll_arcsec)} roll"

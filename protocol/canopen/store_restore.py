@@ -112,8 +112,9 @@ class StoreRestore:
         self._write(LSS, {"node_id": bytes([node_id]), "bit_rate": bit_rate.to_bytes(4, "little")}, ended)
 
     def clear_lss(self) -> None:
-        """Delete what LSS stored; an error is reported as an event."""
-        self._write(LSS, {}, lambda _error: None)
+        """Delete what LSS stored, unless that is under way; an error is reported as an event."""
+        if self._writing.get(LSS) != {}:
+            self._write(LSS, {}, lambda _error: None)
 
     def refusal_of(self, deferred: Deferred) -> SdoAbortError | None:
         """Return why the write that preceded a deferred write of the application has failed; None if it has not."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from types import ModuleType
-from typing import Final, cast
+from typing import Any, Final, cast
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
@@ -25,13 +25,15 @@ def export(icd: InterfaceDefinition, name: str) -> str:
     return cast("Callable[[InterfaceDefinition], str]", _exporter(name, FORMATS).render)(icd)
 
 
-def export_folder(icd: InterfaceDefinition, name: str) -> Mapping[str, str]:
+def export_folder(icd: InterfaceDefinition, name: str, **options: Any) -> Mapping[str, str]:
     """Return the interface definition in a format of several files: texts by path within the folder.
+
+    C takes the option `rows`, names of the rows to write code for.
 
     Raises ProtocolError for an unknown format, and for a definition that the format cannot hold.
     """
     render = _exporter(name, FOLDER_FORMATS).render_folder
-    return cast("Callable[[InterfaceDefinition], Mapping[str, str]]", render)(icd)
+    return cast("Callable[..., Mapping[str, str]]", render)(icd, **options)
 
 
 def _exporter(name: str, formats: Sequence[str]) -> ModuleType:

@@ -66,7 +66,9 @@ def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
     Raises as `open_user_file`, and OSError if the file holds more than `limit` bytes.
     """
     with open_user_file(path) as stream:
-        content = stream.read(limit + 1)
+        content: bytes | None = stream.read(limit + 1)
+    if content is None:  # a file of the kernel that has nothing yet
+        raise UnsuitableFileError(errno.EAGAIN, os.strerror(errno.EAGAIN), str(path))
     if len(content) > limit:
         raise UnsuitableFileError(errno.EFBIG, f"larger than {limit / 1e6:g} MB", str(path))
     return content

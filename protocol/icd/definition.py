@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
@@ -84,6 +84,20 @@ class InterfaceDefinition:
     def model(self) -> DeviceModel:
         """The device model."""
         return device_model()
+
+    def with_rows(self, names: Iterable[str]) -> InterfaceDefinition:
+        """Return the definition with only some of its rows: the telecommand, the telemetry or both of each name."""
+        chosen = dict.fromkeys(names)
+        for name in chosen:
+            if name not in self.telecommands:
+                self.telemetry[name]  # an unknown one raises the error with suggestions
+        telecommands = Names(
+            "telecommand", ((name, row) for name, row in self.telecommands.items() if name in chosen)
+        )
+        telemetry = Names(
+            "telemetry row", ((name, row) for name, row in self.telemetry.items() if name in chosen)
+        )
+        return replace(self, telecommands=telecommands, telemetry=telemetry)
 
     @cached_property
     def _rows_by_key(self) -> Mapping[tuple[str, int], Row]:

@@ -292,11 +292,11 @@ class HeaderBitModel(DefinitionModel):
 class HeaderFieldModel(DefinitionModel):
     """One field of a header.
 
-    Roles: `address` is the address of the device, in both directions; `source` (in a request) and
-    `destination` (in a reply) are the address of the OBC. `class`, `id` and `status` are the codes of class,
-    row and error. `length` is the number of bytes of the parts in `includes`, plus `offset`. `ack` is 0 in a refusal, otherwise 1; `final` is 1 in
-    the last reply to a request. A request with `poll` 0 is executed and not answered; its `default` is 1. A reply repeats the
-    `sequence` and `flags` of its request. `ticks` is the time since start, `time` the time of the unit's clock.
+    Roles: `address` is the address of the device, in both directions; `source` (in a request) and `destination` (in a
+    reply) are the address of the OBC. `class`, `id` and `status` are the codes of class, row and error. `length` is the
+    number of bytes of the parts in `includes`, plus `offset`. `ack` is 0 in a refusal, otherwise 1; `final` is 1 in the
+    last reply to a request. A request with `poll` 0 is executed and not answered; its `default` is 1. A reply repeats
+    the `sequence` and `flags` of its request. `ticks` is the time since start, `time` the time of the unit's clock.
     """
 
     role: Role | None = None

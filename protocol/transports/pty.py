@@ -164,7 +164,11 @@ class PtyTransport(PacedTransport):
                 raise TransportError(f"serial: {link} exists and is not a symlink; choose another name")
             temporary = link.with_name(f".{link.name}.{os.getpid()}")
             temporary.symlink_to(path)
-            temporary.replace(link)
+            try:
+                temporary.replace(link)
+            except OSError:  # the link of another user in /tmp, for example
+                temporary.unlink(missing_ok=True)
+                raise
         except OSError as error:
             raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
 

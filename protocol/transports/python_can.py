@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import threading
 import time
 from collections import deque
@@ -42,6 +43,9 @@ ECHO_LIMIT: Final = 10_000
 BUS_OFF: Final = 0x40
 """Flag in error frames of the kernel: the controller is bus-off."""
 
+BUS_OFF_QUIET_S: Final = 10.0
+"""Time without bus-off after which it is reported again, seconds: a controller that restarts by itself may be bus-off at each frame."""
+
 OpenBus = Callable[[], can.BusABC]
 
 
@@ -64,6 +68,8 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         """The next read, scheduled while frames may be waiting."""
         self._thread: threading.Thread | None = None
         self._queue: deque[CanFrame] = deque()
+        self._bus_off_s = -math.inf
+        """Time at which the bus was last off, on the monotonic clock, seconds."""
         self._timer: asyncio.Handle | None = None
         self._idle = asyncio.Event()
         self._idle.set()
@@ -146,9 +152,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
             return
         if message.is_error_frame:
             if message.arbitration_id & BUS_OFF:
-                self._report_error(
-                    f"CAN {self.description}: bus-off; check the wiring and restart the interface"
-                )
+                self._report_bus_off()
             return
         try:
             frame = CanFrame(
@@ -165,6 +169,11 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
             return
         self.statistics.received += 1
         self._receive(frame)
+
+    def _report_bus_off(self) -> None:
+        last_s, self._bus_off_s = self._bus_off_s, time.monotonic()
+        if self._bus_off_s - last_s > BUS_OFF_QUIET_S:
+            self._report_error(f"CAN {self.description}: bus-off; check the wiring and restart the interface")
 
     def _is_echo(self, frame: CanFrame) -> bool:
         """Return whether a frame is an awaited echo, and stop waiting for it."""

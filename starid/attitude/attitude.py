@@ -24,7 +24,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from starid.arrays import Array
+from starid.elementary import atan2, cos, hypot, sin, square, tan
 from starid.errors import StaridError
+from starid.matrices import dot, length, product
 
 ARCSEC_PER_RAD: Final = 180.0 * 3600.0 / math.pi
 """Arcseconds in one radian."""
@@ -120,8 +122,8 @@ class Attitude:
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape != (3, 3):
             raise StaridError(f"attitude matrix: shape must be (3, 3), not {m.shape}")
-        deviation = float(np.max(np.abs(m @ m.T - np.eye(3))))
-        if not deviation <= _ROTATION_TOLERANCE or float(np.linalg.det(m)) < 0.0:
+        deviation = float(np.max(np.abs(product(m, m.T) - np.eye(3))))
+        if not deviation <= _ROTATION_TOLERANCE or dot(np.cross(m[0], m[1]), m[2]) < 0.0:
             raise StaridError(
                 "attitude matrix: not a rotation; its rows must be orthonormal and right-handed"
             )
@@ -149,7 +151,7 @@ class Attitude:
             )
         north, east, boresight = _local_frame(math.radians(ra_deg % 360.0), math.radians(dec_deg))
         roll = math.radians(roll_deg % 360.0)
-        s, c = math.sin(roll), math.cos(roll)
+        s, c = sin(roll), cos(roll)
         return cls(quaternion_of(np.array([-s * north - c * east, -c * north + s * east, boresight])))
 
     @classmethod
@@ -180,14 +182,14 @@ class Attitude:
     @cached_property
     def _radec_roll(self) -> tuple[float, float, float]:
         (x0, x1, x2), (y0, y1, y2), (bx, by, bz) = self.matrix.tolist()
-        from_axis = math.hypot(bx, by)
+        from_axis = hypot(bx, by)
         on_pole = from_axis < _POLE_RADIUS
-        ra = 0.0 if on_pole else math.atan2(by, bx)
-        dec = math.copysign(0.5 * math.pi, bz) if on_pole else math.atan2(bz, from_axis)
-        sa, ca, sd, cd = math.sin(ra), math.cos(ra), math.sin(dec), math.cos(dec)
+        ra = 0.0 if on_pole else atan2(by, bx)
+        dec = math.copysign(0.5 * math.pi, bz) if on_pole else atan2(bz, from_axis)
+        sa, ca, sd, cd = sin(ra), cos(ra), sin(dec), cos(dec)
         x_north, y_north = -sd * (ca * x0 + sa * x1) + cd * x2, -sd * (ca * y0 + sa * y1) + cd * y2
         x_east, y_east = ca * x1 - sa * x0, ca * y1 - sa * y0
-        roll = math.atan2(y_east - x_north, -x_east - y_north)
+        roll = atan2(y_east - x_north, -x_east - y_north)
         return _turn(ra), math.degrees(dec), _turn(roll)
 
     @property
@@ -207,13 +209,11 @@ class Attitude:
 
     def to_sensor(self, vectors_icrs: Array) -> Array:
         """Transform vectors (n, 3) or (3,) from ICRS to the sensor frame."""
-        turned: Array = vectors_icrs @ self.matrix.T
-        return turned
+        return product(vectors_icrs, self.matrix.T)
 
     def to_icrs(self, vectors_sensor: Array) -> Array:
         """Transform vectors (n, 3) or (3,) from the sensor frame to ICRS."""
-        turned: Array = vectors_sensor @ self.matrix
-        return turned
+        return product(vectors_sensor, self.matrix)
 
     def rotated(self, rotation_vector_sensor_rad: ArrayLike) -> Attitude:
         """Attitude after the sensor has turned by +v: ``A' = exp(−[v]×)·A``.
@@ -225,8 +225,8 @@ class Attitude:
         """
         vx, vy, vz = (float(c) for c in np.asarray(rotation_vector_sensor_rad, dtype=np.float64))
         angle = math.sqrt(vx * vx + vy * vy + vz * vz)
-        k = -0.5 if angle < _SMALL_ANGLE else -math.sin(0.5 * angle) / angle
-        turn = (k * vx, k * vy, k * vz, math.cos(0.5 * angle))
+        k = -0.5 if angle < _SMALL_ANGLE else -sin(0.5 * angle) / angle
+        turn = (k * vx, k * vy, k * vz, cos(0.5 * angle))
         return Attitude(_multiply(turn, self.quaternion_xyzw.tolist()))
 
     def error_to(self, truth: Attitude) -> AttitudeDifference:
@@ -235,10 +235,10 @@ class Attitude:
         x, y, z, w = _multiply(self.quaternion_xyzw.tolist(), (-tx, -ty, -tz, tw)).tolist()
         if w < 0.0:
             x, y, z, w = -x, -y, -z, -w
-        cross = 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w))
-        roll = 2.0 * math.atan2(abs(z), w)
+        cross = 2.0 * atan2(hypot(x, y), hypot(z, w))
+        roll = 2.0 * atan2(abs(z), w)
         half_sine = math.sqrt(x * x + y * y + z * z)
-        total = 2.0 * math.atan2(half_sine, w)
+        total = 2.0 * atan2(half_sine, w)
         k = -2.0 if half_sine < _SMALL_ANGLE else -total / half_sine
         return AttitudeDifference(
             cross_boresight_arcsec=cross * ARCSEC_PER_RAD,
@@ -295,10 +295,10 @@ def interpolate_with_rates(
 
 def _vector_rate(turn: Array, rate: Array) -> Array:
     """Return the derivative of a rotation vector at a body rate (Bortz 1971, eq. 9)."""
-    angle = float(np.linalg.norm(turn))
+    angle = length(turn)
     second = 1.0 / 12.0
     if angle > _SMALL_TURN:
-        second = (1.0 - 0.5 * angle / math.tan(0.5 * angle)) / angle**2
+        second = (1.0 - 0.5 * angle / tan(0.5 * angle)) / square(angle)
     once = np.cross(turn, rate)
     derivative: Array = rate + 0.5 * once + second * np.cross(turn, once)
     return derivative
@@ -312,7 +312,7 @@ def _turn(angle: float) -> float:
 
 def _local_frame(ra: float, dec: float) -> tuple[Array, Array, Array]:
     """Return the unit vectors to north, to east and outward at a point of the sky (radians)."""
-    sa, ca, sd, cd = math.sin(ra), math.cos(ra), math.sin(dec), math.cos(dec)
+    sa, ca, sd, cd = sin(ra), cos(ra), sin(dec), cos(dec)
     north = np.array([-sd * ca, -sd * sa, cd])
     return north, np.array([-sa, ca, 0.0]), np.array([cd * ca, cd * sa, sd])
 
@@ -342,4 +342,4 @@ def quaternion_of(matrix: Array) -> Array:
         (h - f, c - g, d - b, squares[3]),
     )
     q = np.array(rows[squares.index(max(squares))])
-    return q / math.sqrt(float(q @ q))
+    return q / length(q)

@@ -25,7 +25,9 @@ from numpy.typing import ArrayLike
 
 from starid.arrays import Array
 from starid.attitude.attitude import Attitude, quaternion_of
+from starid.elementary import square
 from starid.errors import StaridError
+from starid.matrices import dot, eigenvectors, inverse, length, lengths, product, sum_of_products
 
 Method = Literal["davenport", "quest", "esoq2", "foam", "svd"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
@@ -77,9 +79,9 @@ def solve_wahba(
     w = np.ones(n) if weights is None else np.asarray(weights, dtype=np.float64)
     if w.shape != (n,) or not (np.isfinite(w).all() and (w > 0.0).all()):
         raise StaridError(f"wahba: weights must be {n} positive finite numbers")
-    profile = (b * (w / w.sum())[:, None]).T @ r
-    singular = np.linalg.svd(profile, compute_uv=False)
-    if singular[1] + np.copysign(singular[2], _determinant(profile)) < _MIN_GAP:
+    profile = sum_of_products(b * (w / w.sum())[:, None], r)
+    *_, second, largest = eigenvectors(_davenport_matrix(profile))[0].tolist()
+    if 0.5 * (largest - second) < _MIN_GAP:
         raise StaridError("wahba: the attitude is undetermined; use stars that are further apart")
     return _SOLVERS[method](profile)
 
@@ -106,13 +108,13 @@ def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Array:
     sigma = np.asarray(sigma_rad, dtype=np.float64)
     if sigma.shape not in ((), (len(b),)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
         raise StaridError(f"wahba: standard deviations must be {len(b)} positive finite numbers")
-    information = np.broadcast_to(sigma**-2.0, (len(b),))
-    fisher = information.sum() * np.eye(3) - (b * information[:, None]).T @ b
-    smallest = np.linalg.eigvalsh(fisher)[0] if len(b) else 0.0
+    information = np.broadcast_to(1.0 / square(sigma), (len(b),))
+    fisher = information.sum() * np.eye(3) - sum_of_products(b * information[:, None], b)
+    smallest = eigenvectors(fisher)[0][0] if len(b) else 0.0
     if not smallest > _MIN_GAP * information.sum():
         raise StaridError("wahba: the attitude is undetermined; use stars that are further apart")
-    inverse: Array = np.linalg.inv(fisher)
-    symmetric: Array = 0.5 * (inverse + inverse.T)
+    inverted = inverse(fisher)
+    symmetric: Array = 0.5 * (inverted + inverted.T)
     return symmetric
 
 
@@ -124,7 +126,7 @@ def _directions(name: str, values: ArrayLike) -> Array:
         raise StaridError(f"wahba: {name} directions must be an array of numbers, (n, 3)") from None
     if table.ndim != 2 or table.shape[1] != 3:
         raise StaridError(f"wahba: shape of {name} directions must be (n, 3), not {table.shape}")
-    norms = np.linalg.norm(table, axis=1)
+    norms = lengths(table)
     if not (np.isfinite(norms).all() and (norms > 0.0).all()):
         raise StaridError(f"wahba: {name} directions must be finite and not zero")
     unit: Array = table / norms[:, None]
@@ -156,10 +158,10 @@ def _largest_eigenvalue(profile: Array) -> float:
     ψ(λ) = (λ² − ‖B‖²)² − 8λ det B − 4‖adj B‖². All roots are real, so the steps from above shrink
     monotonically; the iteration ends when they no longer do.
     """
-    norm2 = float(np.vdot(profile, profile))
+    norm2 = float(np.sum(square(profile)))
     determinant = _determinant(profile)
     adjoint = _adjoint(profile)
-    adjoint2 = float(np.vdot(adjoint, adjoint))
+    adjoint2 = float(np.sum(square(adjoint)))
     value, last = 1.0, np.inf
     for _ in range(_NEWTON_STEPS):
         excess = value * value - norm2
@@ -200,7 +202,7 @@ def _polished(profile: Array, quaternion_at: Callable[[float], Array]) -> Array:
     k = _davenport_matrix(profile)
     quaternion = quaternion_at(_largest_eigenvalue(profile))
     for _ in range(_POLISHING_PASSES):
-        quaternion = quaternion_at(float(quaternion @ k @ quaternion))
+        quaternion = quaternion_at(dot(product(k, quaternion), quaternion))
     return quaternion
 
 
@@ -222,7 +224,7 @@ def _turned_back(quaternion: Array, axis: int) -> Array:
 
 def _davenport(profile: Array) -> Attitude:
     """Davenport's q-method: K q = λ_max q (M&M eq. 13)."""
-    _, vectors = np.linalg.eigh(_davenport_matrix(profile))
+    _, vectors = eigenvectors(_davenport_matrix(profile))
     return _attitude(vectors[:, -1])
 
 
@@ -230,7 +232,7 @@ def _svd(profile: Array) -> Attitude:
     """B = U Σ Vᵀ, A = U diag(1, 1, det U det V) Vᵀ."""
     u, _, vt = np.linalg.svd(profile)
     u[:, 2] *= np.sign(_determinant(u) * _determinant(vt))
-    return Attitude.from_matrix(u @ vt)
+    return Attitude.from_matrix(product(u, vt))
 
 
 def _foam(profile: Array) -> Attitude:
@@ -238,7 +240,7 @@ def _foam(profile: Array) -> Attitude:
     norm2 = float(np.sum(profile * profile))
     determinant = _determinant(profile)
     cofactors = _adjoint(profile).T
-    cubic = profile @ profile.T @ profile
+    cubic = product(product(profile, profile.T), profile)
 
     def quaternion_at(value: float) -> Array:
         kappa = 0.5 * (value * value - norm2)
@@ -259,7 +261,7 @@ def _quest(profile: Array) -> Attitude:
     """
     value = _largest_eigenvalue(profile)
     cases = [_quest_vector(_with_reference_turned(profile, axis)) for axis in range(4)]
-    axis = int(np.argmax([float(np.linalg.norm(vector_at(value))) for vector_at in cases]))
+    axis = int(np.argmax([length(vector_at(value)) for vector_at in cases]))
     turned = _with_reference_turned(profile, axis)
     quaternion = _polished(turned, lambda value: _unit(cases[axis](value)))
     return _attitude(_turned_back(quaternion, axis))
@@ -271,8 +273,8 @@ def _quest_vector(profile: Array) -> Callable[[float], Array]:
     sigma, z = float(k[3, 3]), k[:3, 3]
     s = k[:3, :3] + sigma * np.eye(3)
     kappa, delta = float(np.trace(_adjoint(s))), _determinant(s)
-    sz = s @ z
-    ssz = s @ sz
+    sz = product(s, z)
+    ssz = product(s, sz)
 
     def vector_at(value: float) -> Array:
         alpha = value * value - sigma * sigma + kappa
@@ -298,14 +300,14 @@ def _esoq2(profile: Array) -> Attitude:
         m = (value - sigma) * ((value + sigma) * np.eye(3) - s) - np.outer(z, z)
         adjoint = _adjoint(m)
         y = adjoint[:, int(np.argmax(np.abs(np.diag(adjoint))))]
-        return _unit(np.append((value - sigma) * y, z @ y))
+        return _unit(np.append((value - sigma) * y, dot(z, y)))
 
     return _attitude(_turned_back(_polished(turned, quaternion_at), axis))
 
 
 def _unit(vector: Array) -> Array:
     """Scale a vector to length 1."""
-    scaled: Array = vector / np.linalg.norm(vector)
+    scaled: Array = vector / length(vector)
     return scaled
 
 

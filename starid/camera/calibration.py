@@ -25,18 +25,9 @@ from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.attitude.wahba import solve_wahba
 from starid.camera.camera import Camera
+from starid.camera.position_errors import SLOTS, camera_jacobian, rotation_jacobian
 from starid.camera.projection import (
-    CX,
-    CY,
-    FX,
-    FY,
-    K1,
-    K2,
-    K3,
     LIMIT2,
-    P1,
-    P2,
-    jacobian_kernel,
     project_kernel,
 )
 from starid.errors import StaridError
@@ -54,7 +45,6 @@ GROUPS: Final = {
 
 DEFAULT_ESTIMATE: Final = ("focal", "centre", "k1", "k2", "p1", "p2")
 
-_SLOTS: Final = (FX, FY, CX, CY, K1, K2, P1, P2, K3)
 _PRIOR_FOCAL: Final = 0.2
 _PRIOR_CENTRE: Final = 0.1
 _PRIOR_DISTORTION: Final = {"k1": 0.5, "k2": 0.5, "p1": 0.02, "p2": 0.02, "k3": 0.5}
@@ -236,7 +226,7 @@ class _Bundle:
         self.sigmas = tuple(frame.axis_sigmas for frame in frames)
         self.has_sigmas = all(f.sigma_px is not None for f in frames)
         self.used: tuple[Mask, ...] = tuple(np.ones(len(f.xy_px), dtype=np.bool_) for f in frames)
-        self.initial = camera.params[list(_SLOTS)]
+        self.initial = camera.params[list(SLOTS)]
         self.free_to_all = _free_to_all(estimate, self.initial)
         prior = np.array(
             [
@@ -257,7 +247,7 @@ class _Bundle:
     def params(self, values: Array) -> Array:
         """Convert camera values to kernel parameters, without a limit on the distortion."""
         params = self.camera.params.copy()
-        params[list(_SLOTS)] = values
+        params[list(SLOTS)] = values
         params[LIMIT2] = math.inf
         params.flags.writeable = False
         return params
@@ -421,100 +411,3 @@ def _free_to_all(estimate: Sequence[str], values: Array) -> Array:
         elif name != "focal":
             columns += [np.eye(9)[NAMES.index(member)] for member in GROUPS[name]]
     return np.column_stack(columns)
-
-
-def attitude_covariance(
-    camera: Camera,
-    covariance: Array,
-    xy_px: Array,
-    errors_px: Array,
-    offset_px: Array,
-    known_freedom: float,
-) -> tuple[Array, float]:
-    """Covariance (3, 3) of a least-squares attitude, rad², sensor frame, and noise of a star's position, pixels.
-
-    An error p of the camera displaces the stars by Kᵢ p, which turns the attitude that fits them best by
-    ``G p = (Σ RᵢᵀWᵢRᵢ)⁻¹ Σ RᵢᵀWᵢKᵢ p`` to first order; R and K are the derivatives of a star's position with respect to
-    rotation and camera, and Wᵢ is the inverse covariance of its noise. The covariance of the attitude is
-    ``s² (Σ RᵢᵀWᵢRᵢ)⁻¹ + G C Gᵀ``.
-
-    The factor s² comes from the stars' distances from their predicted positions, without what errors of the camera
-    explain: the mean square of the distances after subtracting the likeliest p, plus pᵀC⁻¹p. Distances that the camera
-    causes would otherwise count as noise of the stars, which turns an image more easily than an error of its focal length.
-    With ν degrees of freedom s² is multiplied by ν/(ν − 2), as the posterior of the attitude is Student's.
-
-    Parameters
-    ----------
-    camera : Camera
-        The calibrated camera.
-    covariance : ndarray (9, 9)
-        Covariance C of its parameters, as in `Calibration`.
-    xy_px : ndarray (n, 2)
-        Positions of the stars from which the attitude was computed; n ≥ 2.
-    errors_px : ndarray (n,), (n, 2) or (n, 2, 2)
-        Standard deviation of each position, per star or per axis, pixels, or its covariance, pixels².
-    offset_px : ndarray (n, 2)
-        Positions minus those predicted by the attitude.
-    known_freedom : float
-        Weight of these errors in s², as a number of degrees of freedom for s² = 1.
-    """
-    count = len(xy_px)
-    vectors = camera.back_project(xy_px)
-    errors = error_matrices(errors_px)
-    whiten = np.linalg.inv(np.linalg.cholesky(errors))
-    rotation = (whiten @ rotation_jacobian(camera.params, vectors)).reshape(2 * count, 3)
-    displaced = (whiten @ camera_jacobian(camera.params, vectors) @ _root(covariance)).reshape(2 * count, 9)
-    offset = (whiten @ offset_px[:, :, None]).reshape(2 * count)
-    inverse = np.linalg.inv(rotation.T @ rotation)
-    turn = inverse @ rotation.T @ displaced
-    left, displaced = offset - rotation @ (inverse @ (rotation.T @ offset)), displaced - rotation @ turn
-    shift = np.linalg.solve(np.eye(9) + displaced.T @ displaced, displaced.T @ left)
-    freedom = 2.0 * count - 3.0 + known_freedom
-    unit = (known_freedom + float(left @ left - left @ displaced @ shift)) / freedom
-    student = freedom / (freedom - 2.0) if freedom > 2.0 else 1.0
-    noise_px = math.sqrt(unit * float(np.mean(np.einsum("nii->n", errors))) / 2.0)
-    return np.asarray(unit * student * inverse + turn @ turn.T), noise_px
-
-
-def error_matrices(errors_px: Array) -> Array:
-    """Return covariances (n, 2, 2) of positions; see `attitude_covariance`."""
-    if errors_px.ndim == 3:
-        return errors_px
-    sigmas = np.broadcast_to(errors_px.reshape(len(errors_px), -1), (len(errors_px), 2))
-    return np.asarray(sigmas[:, :, None] ** 2 * np.eye(2))
-
-
-def _root(covariance: Array) -> Array:
-    """Return a matrix L (9, 9) with L Lᵀ = covariance, which may be singular and of any scale."""
-    scale = np.sqrt(np.diag(covariance))
-    scale[scale == 0.0] = 1.0
-    values, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
-    return np.asarray(scale[:, None] * axes * np.sqrt(np.maximum(values, 0.0)))
-
-
-def rotation_jacobian(params: Array, vectors: Array) -> Array:
-    """Derivative (n, 2, 3) of the positions with respect to a sensor rotation e, px/rad: J (v × e)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
-    slopes: Array = jacobian_kernel(params, np.ascontiguousarray(vectors)) @ cross
-    return slopes
-
-
-def camera_jacobian(params: Array, vectors: Array) -> Array:
-    """Derivative (n, 2, 9) of the positions with respect to the camera parameters `NAMES`."""
-    bare = params.copy()
-    bare[list(_SLOTS)] = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    bare.flags.writeable = False
-    a, b = project_kernel(bare, vectors)[0].T
-    fx, fy, cx, cy = params[[FX, FY, CX, CY]]
-    u, v = project_kernel(params, vectors)[0].T
-    s = a * a + b * b
-    slopes = np.zeros((len(vectors), 2, 9))
-    slopes[:, 0, 0], slopes[:, 1, 1] = (u - cx) / fx, (v - cy) / fy
-    slopes[:, 0, 2] = slopes[:, 1, 3] = 1.0
-    for column, power in ((4, 1), (5, 2), (8, 3)):
-        slopes[:, 0, column], slopes[:, 1, column] = fx * a * s**power, fy * b * s**power
-    slopes[:, 0, 6], slopes[:, 1, 6] = fx * 2.0 * a * b, fy * (s + 2.0 * b * b)
-    slopes[:, 0, 7], slopes[:, 1, 7] = fx * (s + 2.0 * a * a), fy * 2.0 * a * b
-    return slopes

@@ -14,7 +14,7 @@ from typing import Any, Final, Literal, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array, Mask
+from starid.arrays import Array, Mask, elementwise
 from starid.attitude import Attitude
 from starid.camera.projection import (
     EQUIDISTANT,
@@ -29,7 +29,9 @@ from starid.camera.projection import (
     project_kernel,
     undistorted_reach,
 )
+from starid.elementary import atan2, square, tan
 from starid.errors import StaridError
+from starid.matrices import lengths
 
 Model = Literal["pinhole", "equidistant", "flat"]
 
@@ -125,7 +127,7 @@ class Camera:
                 f"camera fov_deg: must be degrees in (0, {widest:g}] for {model}, not {fov_deg!r}"
             )
         half = math.radians(fov_deg) / 2.0
-        reach = math.tan(half) if model == "pinhole" else half
+        reach = tan(half) if model == "pinhole" else half
         centre = ((width - 1) / 2.0, (height - 1) / 2.0)
         terms = _terms(distortion)
         if not any(terms):
@@ -182,12 +184,12 @@ class Camera:
                 *self.distortion,
                 self.width,
                 self.height,
-                math.pi**2 if self.model == "equidistant" else math.inf,
+                square(math.pi) if self.model == "equidistant" else math.inf,
             ],
             dtype=np.float64,
         )
         if any(self.distortion):
-            params[LIMIT2] = _one_to_one_limit(params, self.border(_BORDER_SAMPLES)) ** 2
+            params[LIMIT2] = square(_one_to_one_limit(params, self.border(_BORDER_SAMPLES)))
         params.flags.writeable = False
         return params
 
@@ -207,14 +209,14 @@ class Camera:
         """Horizontal field of view on the row of the centre, edge to edge, degrees."""
         row = self.centre_px[1]
         edges = self.back_project(np.array([[-0.5, row], [self.width - 0.5, row]]))
-        left, right = np.arctan2(edges[:, 0], edges[:, 2])
+        left, right = elementwise(atan2, edges[:, 0], edges[:, 2]).tolist()
         return math.degrees(right - left)
 
     @cached_property
     def field_radius_rad(self) -> float:
         """Largest angle from the boresight to the border of the pixel array, radians."""
         vectors = self.back_project(self.border(_BORDER_SAMPLES))
-        angles = np.arctan2(np.hypot(vectors[:, 0], vectors[:, 1]), vectors[:, 2])
+        angles = elementwise(atan2, lengths(vectors[:, :2]), vectors[:, 2])
         return math.pi if bool(np.any(np.isnan(angles))) else float(np.max(angles))
 
     def border(self, samples: int) -> Array:
@@ -366,7 +368,7 @@ def _one_to_one_limit(params: Array, border: Array) -> float:
     turns = [1.0 / float(r.real) for r in inverse if abs(r.imag) < 1e-9 * abs(r) and r.real > _NEVER_TURNS]
     fold = math.sqrt(min([*turns, params[LIMIT2]]))
     probe = params.copy()
-    probe[LIMIT2] = fold**2
+    probe[LIMIT2] = square(fold)
     reach = undistorted_reach(probe, border)
     limit = min(_MARGIN * reach, reach + _FOLD_SHARE * (fold - reach))
     if not (math.isfinite(reach) and is_one_to_one(params, limit, 40, 48)):

@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Mask
+from starid.elementary import atan2, cos, hypot, sin
 from starid.kernels.jit import compiled, inner_checked
 
 PINHOLE: Final = 0
@@ -56,17 +57,17 @@ def to_plane(model: float, x: float, y: float, z: float) -> tuple[float, float, 
             return math.nan, math.nan, False
         return x / z, y / z, True
     if model == EQUIDISTANT:
-        rho = math.hypot(x, y)
+        rho = hypot(x, y)
         if rho < _TINY:
             if z <= 0.0:
                 return math.nan, math.nan, False
             return 0.0, 0.0, True
-        g = math.atan2(rho, z) / rho
+        g = atan2(rho, z) / rho
         return g * x, g * y, True
-    c = math.hypot(x, z)
+    c = hypot(x, z)
     if c < _TINY and abs(y) < _TINY:
         return math.nan, math.nan, False
-    return math.atan2(x, z), math.atan2(y, c), True
+    return atan2(x, z), atan2(y, c), True
 
 
 @inner_checked
@@ -76,15 +77,15 @@ def from_plane(model: float, a: float, b: float) -> tuple[float, float, float, b
         k = 1.0 / math.sqrt(1.0 + a * a + b * b)
         return a * k, b * k, k, True
     if model == EQUIDISTANT:
-        theta = math.hypot(a, b)
+        theta = hypot(a, b)
         if theta > math.pi:
             return math.nan, math.nan, math.nan, False
-        k = 1.0 if theta < _TINY else math.sin(theta) / theta
-        return a * k, b * k, math.cos(theta), True
+        k = 1.0 if theta < _TINY else sin(theta) / theta
+        return a * k, b * k, cos(theta), True
     if abs(a) > math.pi or abs(b) > 0.5 * math.pi:
         return math.nan, math.nan, math.nan, False
-    c = math.cos(b)
-    return c * math.sin(a), math.sin(b), c * math.cos(a), True
+    c = cos(b)
+    return c * sin(a), sin(b), c * cos(a), True
 
 
 @inner_checked
@@ -125,8 +126,8 @@ def undistort(params: Array, a: float, b: float) -> tuple[float, float, bool]:
         u, v = u * shrink, v * shrink
     da, db = distort(params, u, v)
     ra, rb = a - da, b - db
-    residual = math.hypot(ra, rb)
-    scale = 1.0 + math.hypot(a, b)
+    residual = hypot(ra, rb)
+    scale = 1.0 + hypot(a, b)
     for _ in range(_MAX_ITERATIONS):
         if residual <= _RESIDUAL * scale:
             break
@@ -142,7 +143,7 @@ def undistort(params: Array, a: float, b: float) -> tuple[float, float, bool]:
             nu, nv = u + fraction * step_u, v + fraction * step_v
             if nu * nu + nv * nv <= limit2:
                 da, db = distort(params, nu, nv)
-                candidate = math.hypot(a - da, b - db)
+                candidate = hypot(a - da, b - db)
                 if candidate < residual:
                     u, v, ra, rb, residual = nu, nv, a - da, b - db, candidate
                     better = True
@@ -216,7 +217,7 @@ def plane_slopes(
             g = (1.0 - rho2 / (3.0 * z * z)) / z
             h = -2.0 / (3.0 * z * z * z)
         else:
-            g = math.atan2(rho, z) / rho
+            g = atan2(rho, z) / rho
             h = (z / r2 - g) / rho2
         return g + x * x * h, x * y * h, -x / r2, x * y * h, g + y * y * h, -y / r2
     c2 = x * x + z * z
@@ -257,7 +258,7 @@ def undistorted_reach(params: Array, xy: Array) -> float:
         a, b, solved = undistort(params, u, v)
         if not solved:
             return math.nan
-        reach = max(reach, math.hypot(a, b))
+        reach = max(reach, hypot(a, b))
     return reach
 
 
@@ -267,7 +268,7 @@ def is_one_to_one(params: Array, limit: float, radii: int, angles: int) -> bool:
     for i in range(radii):
         for j in range(angles):
             radius, angle = limit * i / (radii - 1), 2.0 * math.pi * j / angles
-            j11, j12, j22 = distort_slopes(params, radius * math.cos(angle), radius * math.sin(angle))
+            j11, j12, j22 = distort_slopes(params, radius * cos(angle), radius * sin(angle))
             if j11 * j22 - j12 * j12 <= 0.0 or j11 <= 0.0:
                 return False
     return True

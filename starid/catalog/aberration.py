@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from starid.arrays import Array
 from starid.errors import StaridError
+from starid.matrices import length
 
 SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
 
@@ -44,7 +45,7 @@ def checked_beta(velocity_m_s: ArrayLike | None) -> Array:
         velocity = np.asarray(velocity_m_s, dtype=np.float64)
     except (TypeError, ValueError):
         velocity = np.empty(0)
-    if velocity.shape != (3,) or not float(np.linalg.norm(velocity)) <= FASTEST_M_S:
+    if velocity.shape != (3,) or not length(velocity) <= FASTEST_M_S:
         given = " ".join(repr(velocity_m_s).split())
         raise StaridError(
             f"observer_velocity: must be three numbers in m/s (ICRS) of at most {FASTEST_M_S:g}, not {given[:60]}"

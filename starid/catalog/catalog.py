@@ -18,7 +18,9 @@ from starid.catalog.aberration import aberrated
 from starid.catalog.hipparcos import EPOCH, default_path, read_hip2
 from starid.catalog.photometry import absolute_magnitude, fitted_share, flux_ratio, v_from_hp
 from starid.catalog.published import PUBLISHED_V, with_missing_stars
+from starid.elementary import asin, atan2, cos, hypot, log10, sin, square
 from starid.errors import StaridError
+from starid.matrices import length, lengths
 from starid.storage.cache import cached_tables
 
 Band = Literal["v", "hp"]
@@ -132,8 +134,8 @@ class StarCatalog:
         if velocity_m_s is None:
             return self
         vectors = aberrated(self.vectors, velocity_m_s)
-        ra = elementwise(math.atan2, vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi)
-        dec = np.arctan2(vectors[:, 2], np.hypot(vectors[:, 0], vectors[:, 1]))
+        ra = elementwise(atan2, vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi)
+        dec = elementwise(atan2, vectors[:, 2], lengths(vectors[:, :2]))
         return dataclasses.replace(self, vectors=vectors, ra_rad=ra, dec_rad=dec)
 
     def in_cone(self, direction: ArrayLike, radius_rad: float) -> NDArray[np.intp]:
@@ -147,20 +149,20 @@ class StarCatalog:
             Angle, radians; the rim belongs to the cone.
         """
         axis = np.asarray(direction, dtype=np.float64)
-        norm = float(np.linalg.norm(axis)) if axis.shape == (3,) else 0.0
+        norm = length(axis) if axis.shape == (3,) else 0.0
         if not (norm > 0.0 and math.isfinite(norm)):
             raise StaridError("star catalogue: cone direction must be three finite numbers, not all zero")
         if not radius_rad >= 0.0:
             raise StaridError(f"star catalogue: cone radius must be radians ≥ 0, not {radius_rad}")
         axis = axis / norm
         order, dec, vectors = self._by_declination
-        centre = math.atan2(axis[2], math.hypot(axis[0], axis[1]))
+        centre = atan2(axis[2], hypot(axis[0], axis[1]))
         first, last = np.searchsorted(dec, [centre - radius_rad - 1e-12, centre + radius_rad + 1e-12])
         if radius_rad >= math.pi:
             return np.arange(len(self))
         gap = vectors[first:last] - axis
-        chord = 2.0 * math.sin(0.5 * radius_rad)
-        near = np.einsum("ij,ij->i", gap, gap) <= chord * chord * (1.0 + 1e-12)
+        chord = 2.0 * sin(0.5 * radius_rad)
+        near = np.sum(square(gap), axis=1) <= chord * chord * (1.0 + 1e-12)
         return np.sort(order[first:last][near])
 
     @cached_property
@@ -248,9 +250,9 @@ def _tables(source: Path, epoch: float) -> dict[str, NDArray[np.generic]]:
         columns["ra_rad"], columns["dec_rad"], columns["pm_ra_mas_yr"], columns["pm_dec_mas_yr"], epoch
     )
     x, y, z = vectors.T
-    ra = elementwise(math.atan2, y, x)
+    ra = elementwise(atan2, y, x)
     ra[ra < 0.0] += 2.0 * math.pi
-    dec = elementwise(math.atan2, z, np.sqrt(x * x + y * y))
+    dec = elementwise(atan2, z, np.sqrt(x * x + y * y))
     columns |= {"vectors": vectors, "ra_rad": ra, "dec_rad": dec}
     v = v_from_hp(columns["hp"], columns["b_v"], columns["v_i"])
     for hip, published in PUBLISHED_V.items():
@@ -261,8 +263,8 @@ def _tables(source: Path, epoch: float) -> dict[str, NDArray[np.generic]]:
 
 def moved(ra_rad: Array, dec_rad: Array, pm_ra_mas_yr: Array, pm_dec_mas_yr: Array, epoch: float) -> Array:
     """Unit vectors (n, 3), at a Julian year, of stars given at J1991.25 (see `load_catalog`)."""
-    sa, ca = elementwise(math.sin, ra_rad), elementwise(math.cos, ra_rad)
-    sd, cd = elementwise(math.sin, dec_rad), elementwise(math.cos, dec_rad)
+    sa, ca = elementwise(sin, ra_rad), elementwise(cos, ra_rad)
+    sd, cd = elementwise(sin, dec_rad), elementwise(cos, dec_rad)
     years = (epoch - EPOCH) * _RAD_PER_MAS
     east, north = years * pm_ra_mas_yr, years * pm_dec_mas_yr
     x = cd * ca - east * sa - north * sd * ca
@@ -335,23 +337,23 @@ def merge_close_stars(
     positions = catalog.vectors
     if as_fitted:
         gap = positions - positions[leader]
-        distance = np.linalg.norm(gap, axis=1) / max(_chord(separation_rad), 1e-12)
+        distance = lengths(gap) / max(_chord(separation_rad), 1e-12)
         positions = positions[leader] + fitted_share(distance, flux / flux[leader])[:, None] * gap
     sums = np.zeros((len(catalog), 3))
     np.add.at(sums, leader, positions * flux[:, None])
     kept = np.flatnonzero(leader == np.arange(len(catalog)))
     grown = np.bincount(leader, minlength=len(catalog))[kept] > 1
     vectors = catalog.vectors[kept].copy()
-    vectors[grown] = sums[kept][grown] / np.linalg.norm(sums[kept][grown], axis=1, keepdims=True)
+    vectors[grown] = sums[kept][grown] / lengths(sums[kept][grown])[:, None]
     magnitudes = {}
     for name in ("hp", "v"):
         values = getattr(catalog, name)
-        summed = -2.5 * elementwise(math.log10, np.bincount(leader, flux_ratio(values), len(catalog))[kept])
+        summed = -2.5 * elementwise(log10, np.bincount(leader, flux_ratio(values), len(catalog))[kept])
         magnitudes[name] = np.where(grown, summed, values[kept])
     ra = np.where(
-        grown, elementwise(math.atan2, vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi), catalog.ra_rad[kept]
+        grown, elementwise(atan2, vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi), catalog.ra_rad[kept]
     )
-    dec = np.where(grown, elementwise(math.asin, np.clip(vectors[:, 2], -1.0, 1.0)), catalog.dec_rad[kept])
+    dec = np.where(grown, elementwise(asin, np.clip(vectors[:, 2], -1.0, 1.0)), catalog.dec_rad[kept])
     merged = dataclasses.replace(
         catalog.subset(kept), vectors=vectors, ra_rad=ra, dec_rad=dec, hp=magnitudes["hp"], v=magnitudes["v"]
     )
@@ -360,7 +362,7 @@ def merge_close_stars(
 
 def _chord(angle_rad: float) -> float:
     """Distance between the tips of two unit vectors at an angle."""
-    return 2.0 * math.sin(0.5 * min(angle_rad, math.pi))
+    return 2.0 * sin(0.5 * min(angle_rad, math.pi))
 
 
 def close_pairs(ones: Array, others: Array, distance: float) -> NDArray[np.intp]:
@@ -381,7 +383,7 @@ def close_pairs(ones: Array, others: Array, distance: float) -> NDArray[np.intp]
         one = np.repeat(first_order, count)
         other = order[np.arange(len(one)) + np.repeat(first - np.cumsum(count) + count, count)]
         gap = others[other] - ones[one]
-        close = np.einsum("ij,ij->i", gap, gap) <= distance * distance
+        close = np.sum(square(gap), axis=1) <= distance * distance
         pairs.append(np.column_stack([one[close], other[close]]))
     return np.concatenate(pairs)
 

@@ -10,10 +10,14 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from typing import Any, Final
 
-from starid.arrays import Array
+from starid.arrays import Array, on_grid
 
 ASTRONOMICAL_UNIT_M: Final = 149_597_870_700.0
 DAY_S: Final = 86_400.0
+
+_POSITION_GRID_M: Final = 0.25
+VELOCITY_GRID_M_S: Final = 2.0**-20
+"""Velocities from `erfa` and SGP4 are multiples of this (`on_grid`)."""
 
 UNIX_EPOCH_JD: Final = 2_440_587.5
 """Julian date of 1970-01-01."""
@@ -101,4 +105,5 @@ def earth_velocity(unix_s: float) -> Array:
 
 def in_metres(pv: Any) -> tuple[Array, Array]:
     """Convert a position–velocity record of `erfa` (au, au/d) to metres and m/s."""
-    return pv["p"] * ASTRONOMICAL_UNIT_M, pv["v"] * (ASTRONOMICAL_UNIT_M / DAY_S)
+    position, velocity = pv["p"] * ASTRONOMICAL_UNIT_M, pv["v"] * (ASTRONOMICAL_UNIT_M / DAY_S)
+    return on_grid(position, _POSITION_GRID_M), on_grid(velocity, VELOCITY_GRID_M_S)

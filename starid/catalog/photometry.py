@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array, elementwise
+from starid.arrays import Array, elementwise, interpolated
+from starid.elementary import exp, log10, power, square
 
 EVEN_PAIR: Final = 0.45
 """Brightness ratio from which a single spot fits two stars at their centre of light."""
@@ -68,8 +68,8 @@ def v_from_hp(hp: ArrayLike, b_v: ArrayLike, v_i: ArrayLike) -> Array:
     hp_, b_v_, v_i_ = np.broadcast_arrays(
         np.asarray(hp, np.float64), np.asarray(b_v, np.float64), np.asarray(v_i, np.float64)
     )
-    by_b_v = np.interp(b_v_, _BLUE_TO_RED_B_V, _BLUE_TO_RED_V_HP)
-    by_v_i = np.interp(v_i_, _RED_V_I, _RED_V_HP)
+    by_b_v = interpolated(b_v_, _BLUE_TO_RED_B_V, _BLUE_TO_RED_V_HP)
+    by_v_i = interpolated(v_i_, _RED_V_I, _RED_V_HP)
     share = np.clip((v_i_ - _RED_FROM) / (_RED_WHOLLY_FROM - _RED_FROM), 0.0, 1.0)
     no_b_v, no_v_i = np.isnan(b_v_), np.isnan(v_i_)
     share = np.where(no_v_i, 0.0, share)
@@ -85,13 +85,13 @@ def absolute_magnitude(magnitude: ArrayLike, parallax_mas: ArrayLike) -> Array:
     """
     parallax = np.asarray(parallax_mas, np.float64)
     positive = np.where(parallax > 0.0, parallax, np.nan)
-    absolute: Array = np.asarray(magnitude, np.float64) + 5.0 * np.log10(positive) - 10.0
+    absolute: Array = np.asarray(magnitude, np.float64) + 5.0 * elementwise(log10, positive) - 10.0
     return absolute
 
 
 def flux_ratio(magnitude: ArrayLike) -> Array:
     """Flux of a magnitude relative to magnitude zero: 10^(−0.4·m)."""
-    return elementwise(partial(math.pow, 10.0), -0.4 * np.asarray(magnitude, np.float64))
+    return elementwise(partial(power, 10.0), -0.4 * np.asarray(magnitude, np.float64))
 
 
 def fitted_share(distance: Array, brightness_ratio: Array) -> Array:
@@ -108,6 +108,6 @@ def fitted_share(distance: Array, brightness_ratio: Array) -> Array:
     brightness_ratio : ndarray
         Ratio of the companion's flux to the star's, at most 1.
     """
-    return 1.0 - (1.0 - elementwise(math.exp, -(distance**2))) * np.maximum(
-        1.0 - (brightness_ratio / EVEN_PAIR) ** 2, 0.0
+    return 1.0 - (1.0 - elementwise(exp, -square(distance))) * np.maximum(
+        1.0 - square(brightness_ratio / EVEN_PAIR), 0.0
     )

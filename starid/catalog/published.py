@@ -11,6 +11,7 @@ import numpy as np
 from starid.arrays import Array
 from starid.catalog.hipparcos import EPOCH
 from starid.catalog.photometry import v_from_hp
+from starid.elementary import cos
 
 PUBLISHED_V: Final = {32349: -1.44, 30438: -0.74, 71681: 1.33, 55203: 3.79, 78727: 4.17}
 """Published V: Sirius and Canopus, which are too bright for Hipparcos; alpha Centauri B, whose Hp has light of A; and the missing
@@ -53,7 +54,7 @@ def with_missing_stars(columns: dict[str, Array]) -> dict[str, Array]:
     added: dict[str, list[float]] = {
         "hip": [star.hip for star in stars],
         "ra_rad": [
-            math.radians(s.ra_deg) + years * s.pm_ra_mas_yr / math.cos(math.radians(s.dec_deg)) for s in stars
+            math.radians(s.ra_deg) + years * s.pm_ra_mas_yr / cos(math.radians(s.dec_deg)) for s in stars
         ],
         "dec_rad": [math.radians(star.dec_deg) + years * star.pm_dec_mas_yr for star in stars],
         "parallax_mas": [star.parallax_mas for star in stars],

@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from starid.arrays import Array, Indices
+from starid.elementary import cos
 
 _UNIX_EPOCH_JD: Final = 2_440_587.5
 _DAY_S: Final = 86_400.0
@@ -68,8 +69,8 @@ def _magnitude(star: VariableStar, jd: float) -> float:
     if math.isnan(star.second):
         fall = 1.0 - star.share
         wave = phase / fall if phase < fall else (1.0 - phase) / star.share
-        return star.brightest + 0.5 * depth * (1.0 - math.cos(math.pi * wave))
+        return star.brightest + 0.5 * depth * (1.0 - cos(math.pi * wave))
     from_first = min(phase, 1.0 - phase)
     dip, away = (depth, from_first) if from_first < 0.25 else (star.second - star.brightest, 0.5 - from_first)
     inside = 2.0 * away / star.share
-    return star.brightest + (0.5 * dip * (1.0 + math.cos(math.pi * inside)) if inside < 1.0 else 0.0)
+    return star.brightest + (0.5 * dip * (1.0 + cos(math.pi * inside)) if inside < 1.0 else 0.0)

@@ -47,7 +47,8 @@ def command(
         str,
         typer.Option(
             help="Solvers: geometric,lsi,rsi, lsi-matlab,lsi-sklearn, published ones such as pyramid,grid "
-            "(pyramid-even: with evenly spread guide stars), or MODULE:FUNCTION; 'all': geometric, lsi, rsi, the published and the third-party ones."
+            "(pyramid-even: with evenly spread guide stars), or MODULE:FUNCTION; 'all': geometric, lsi, rsi, the published and "
+            "the third-party ones."
         ),
     ] = "geometric",
     frames: Annotated[int, typer.Option(min=1, help="Scenes per row.")] = 300,

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import inspect
 import itertools
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Final, NoReturn
@@ -56,7 +58,11 @@ OMITTED_VALUE: Final = "auto"
 
 
 class _PlainHelp:
-    """Help that shows flags without a type, and positional arguments in capitals."""
+    """Help that shows flags without a type, positional arguments in capitals, and paragraphs without the lines of their source."""
+
+    def __init__(self, *arguments: Any, help: str | None = None, **options: Any) -> None:  # noqa: A002 (the name is typer's)
+        text = re.sub(r"(?<=\S)\n(?=\S)", " ", inspect.cleandoc(help or ""))
+        super().__init__(*arguments, help=text, **options)  # type: ignore[call-arg]
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the parameters, each with its metavar for the help."""

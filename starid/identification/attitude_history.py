@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from starid.arrays import Array
 from starid.attitude import Attitude, propagate
+from starid.elementary import square
 
 RATE_SPAN_S: Final = 2.0
 """Age up to which attitudes are used for the rate, seconds; the last two are always used."""
@@ -42,7 +43,10 @@ class AttitudeHistory:
     def add(
         self, at: float, attitude: Attitude, longest_gap_s: float, covariance: Array | None = None
     ) -> None:
-        """Add an attitude, with the covariance (3, 3) of its error, rad², if known; older ones are discarded after an interruption, after a longer gap, or if time has not passed."""
+        """Add an attitude, with the covariance (3, 3) of its error, rad², if known.
+
+        Older ones are discarded after an interruption, after a longer gap, or if time has not passed.
+        """
         follows = self._fixes and 0 < at - self._fixes[-1][0] <= longest_gap_s * self._per_second
         if self._interrupted or not follows:
             self._fixes.clear()
@@ -64,7 +68,7 @@ class AttitudeHistory:
         times = np.array([(time - latest) / self._per_second for time, _ in recent])
         turns = np.array([attitude.error_to(newest).rotation_vector_rad for _, attitude in recent])
         times -= times.mean()
-        x, y, z = (times @ turns / (times @ times)).tolist()
+        x, y, z = (np.sum(times[:, None] * turns, axis=0) / np.sum(square(times))).tolist()
         return (x, y, z)
 
     def predict(self, at: float, rate_rad_s: ArrayLike | None) -> Attitude | None:
@@ -84,5 +88,5 @@ class AttitudeHistory:
             return None
         before, last = self._fixes[-2][0], self._fixes[-1][0]
         steps = (at - last) / (last - before)
-        covariance = (1.0 + steps) ** 2 * self._errors[-1] + steps**2 * self._errors[-2]
+        covariance = square(1.0 + steps) * self._errors[-1] + square(steps) * self._errors[-2]
         return covariance if np.isfinite(covariance).all() else None

@@ -23,14 +23,16 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arrays import Array, Indices, elementwise
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.camera.calibration import camera_jacobian, error_matrices, rotation_jacobian
+from starid.camera.position_errors import camera_jacobian, error_matrices, rotation_jacobian
 from starid.catalog import StarCatalog
 from starid.catalog.aberration import aberrated
+from starid.elementary import exp, log, log10, square
 from starid.identification.solution import Reason, Solution
 from starid.imaging.detection import Detections
+from starid.matrices import carried, dot, eigenvectors, inverse, product
 
 MIN_STARS: Final = 2
 """Least number of stars."""
@@ -40,6 +42,8 @@ GATE: Final = 13.8
 
 MAGNITUDE_GATE: Final = 1.0
 """Largest difference from the expected magnitude, besides three sigmas of the flux: colours of stars, and their variability."""
+
+_TWO_PI_TO_3_2: Final = 2.0 * math.pi * math.sqrt(2.0 * math.pi)
 
 _SINGULAR: Final = 1e12
 """Condition from which stars do not determine all three axes."""
@@ -56,7 +60,9 @@ def noise_peaks(ratio: Array, sigma_px: float) -> Array:
 
     Adler (1981), theorem 6.3.1: ``|Λ|^½ (2π)^(−3/2) u exp(−u²/2)``, where ``Λ = 1/(2σ²)`` is the variance of the slopes.
     """
-    return np.asarray(ratio * np.exp(-0.5 * ratio**2) / ((2.0 * math.pi) ** 1.5 * 2.0 * sigma_px**2))
+    return np.asarray(
+        ratio * elementwise(exp, -0.5 * square(ratio)) / (_TWO_PI_TO_3_2 * 2.0 * square(sigma_px))
+    )
 
 
 def expected_places(
@@ -127,25 +133,21 @@ def solve_with_prediction(
     off = found.xy_px[None, :, :] - places[:, None, :]
     known = np.zeros((9, 9)) if known is None else known
     by_camera = camera_jacobian(camera.params, seen)
-    spread = slopes @ covariance @ slopes.transpose(0, 2, 1) + by_camera @ known @ by_camera.transpose(
-        0, 2, 1
-    )
+    spread = carried(slopes, covariance) + carried(by_camera, known)
     gates = spread[:, None] + errors[None, :]
-    distance2 = np.einsum("ijk,ijkl,ijl->ij", off, np.linalg.inv(gates), off)
+    distance2 = _squares(off, inverse(gates))
     with np.errstate(divide="ignore", invalid="ignore"):
-        fainter = zero_point - 2.5 * np.log10(found.flux[None, :]) - stars.v[rows][:, None]
+        fainter = zero_point - 2.5 * elementwise(log10, found.flux)[None, :] - stars.v[rows][:, None]
     blur = 1.0857 * found.flux_sigma / found.flux
     fits = (distance2 <= GATE) & (np.abs(fainter) <= MAGNITUDE_GATE + 3.0 * blur[None, :])
     pairs = _assigned(distance2 + np.where(fits, 0.0, np.inf))
     while len(pairs) >= MIN_STARS:
         place, row = pairs.T
-        weights = np.linalg.inv(
-            gates[place, row] - slopes[place] @ covariance @ slopes[place].transpose(0, 2, 1)
-        )
+        weights = inverse(gates[place, row] - carried(slopes[place], covariance))
         turn, gain, information = _combined(slopes[place], off[place, row], weights, covariance)
-        residual = off[place, row] - slopes[place] @ turn
-        each = np.einsum("ni,nij,nj->n", residual, weights, residual)
-        chi2 = float(each.sum() + turn @ np.linalg.solve(covariance, turn))
+        residual = off[place, row] - product(slopes[place], turn)
+        each = _squares(residual, weights)
+        chi2 = float(each.sum() + dot(turn, product(inverse(covariance), turn)))
         if chi2 <= _MAX_CHI2[min(len(pairs), len(_MAX_CHI2)) - 1] + 2.0 * max(len(pairs) - len(_MAX_CHI2), 0):
             break
         pairs = np.delete(pairs, int(np.argmax(each)), axis=0)
@@ -153,7 +155,8 @@ def solve_with_prediction(
         return invalid
     if _unnoticed_rad(turn, information, covariance) > max_error_rad:
         return invalid
-    area = math.pi * GATE * np.sqrt(np.linalg.det(gates[place, row]))
+    gate = gates[place, row]
+    area = math.pi * GATE * np.sqrt(gate[:, 0, 0] * gate[:, 1, 1] - gate[:, 0, 1] * gate[:, 1, 0])
     ratio = np.maximum(found.flux[row] / found.flux_sigma[row], 1.0)
     magnitude = stars.v[rows]
     alike = (
@@ -162,14 +165,14 @@ def solve_with_prediction(
     by_chance = alike * (noise_peaks(ratio, found.psf_sigma_px) + alike / (camera.width * camera.height))
     if rivals is not None:
         by_chance = by_chance + rivals[row]
-    log_false = float(np.log(area * by_chance).sum()) - math.lgamma(len(pairs) + 1)
-    if log_false > math.log(max_false_probability):
+    log_false = math.fsum(log(each / (k + 1.0)) for k, each in enumerate((area * by_chance).tolist()))
+    if log_false > log(max_false_probability):
         return invalid
     # errors of the camera displace neighbouring stars alike, so they are not averaged
-    from_camera = np.einsum("nij,njk->ik", gain, by_camera[place])
-    rest = np.eye(3) - np.einsum("nij,njk->ik", gain, slopes[place])
-    noise = np.einsum("nij,njk,nlk->il", gain, errors[row], gain)
-    posterior = noise + rest @ covariance @ rest.T + from_camera @ known @ from_camera.T
+    from_camera = np.sum(product(gain, by_camera[place]), axis=0)
+    rest = np.eye(3) - np.sum(product(gain, slopes[place]), axis=0)
+    noise = np.sum(carried(gain, errors[row]), axis=0)
+    posterior = noise + carried(rest, covariance) + carried(from_camera, known)
     return Solution(
         valid=True,
         reason=Reason.OK,
@@ -178,9 +181,9 @@ def solve_with_prediction(
         catalog_index=rows[place],
         hip=stars.hip[rows[place]],
         covariance=posterior,
-        rms_px=math.sqrt(float(np.mean(np.sum(residual**2, axis=1)))),
-        sigma_px=math.sqrt(float(np.mean(np.einsum("nii->n", errors[row]))) / 2.0),
-        probability_false=math.exp(min(log_false, 0.0)),
+        rms_px=math.sqrt(float(np.mean(np.sum(square(residual), axis=1)))),
+        sigma_px=math.sqrt(float(np.mean(errors[row, 0, 0] + errors[row, 1, 1])) / 2.0),
+        probability_false=exp(min(log_false, 0.0)),
         mode="tracking",
     )
 
@@ -199,19 +202,28 @@ def _assigned(cost: Array) -> Indices:
 
 def _combined(slopes: Array, off: Array, weights: Array, covariance: Array) -> tuple[Array, Array, Array]:
     """Return the weighted mean of prediction and stars, a rotation (3,), the gains (n, 3, 2), and the stars' information (3, 3)."""
-    information = np.einsum("nij,nik,nkl->jl", slopes, weights, slopes)
-    gain = np.linalg.inv(np.linalg.inv(covariance) + information) @ slopes.transpose(0, 2, 1) @ weights
-    return np.asarray(np.einsum("nij,nj->i", gain, off)), np.asarray(gain), np.asarray(information)
+    weighted = product(slopes.transpose(0, 2, 1), weights)
+    information = np.sum(product(weighted, slopes), axis=0)
+    gain = product(inverse(inverse(covariance) + information), weighted)
+    return np.sum(product(gain, off[:, :, None])[:, :, 0], axis=0), gain, np.asarray(information)
+
+
+def _squares(offsets: Array, weights: Array) -> Array:
+    """Return xᵀ W x for vectors (…, 2) and matrices (…, 2, 2)."""
+    x, y = offsets[..., 0], offsets[..., 1]
+    mixed = weights[..., 0, 1] + weights[..., 1, 0]
+    return np.asarray(square(x) * weights[..., 0, 0] + x * y * mixed + square(y) * weights[..., 1, 1])
 
 
 def _unnoticed_rad(turn: Array, information: Array, covariance: Array) -> float:
     """Largest error about any axis that a wrong prediction may leave; infinite if stars and prediction contradict each other."""
-    prior = np.linalg.inv(covariance)
-    if np.linalg.cond(information) > _SINGULAR:
+    prior = inverse(covariance)
+    axes, _ = eigenvectors(information)
+    if not axes[2] <= _SINGULAR * axes[0]:
         return math.inf
-    stars = np.linalg.inv(information)
-    alone = stars @ (prior + information) @ turn
-    if alone @ np.linalg.solve(covariance + stars, alone) > _MAX_CONTRADICTION:
+    stars = inverse(information)
+    alone = product(product(stars, prior + information), turn)
+    if dot(alone, product(inverse(covariance + stars), alone)) > _MAX_CONTRADICTION:
         return math.inf
-    left = np.diag(stars - np.linalg.inv(prior + information))
+    left = np.diag(stars - inverse(prior + information))
     return math.sqrt(_MAX_CONTRADICTION * max(float(left.max()), 0.0))

@@ -15,6 +15,7 @@ from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog, load_catalog
+from starid.elementary import square
 from starid.errors import StaridError
 from starid.identification.solution import Solution
 
@@ -34,7 +35,7 @@ def _magnitudes(xy: Array, brightness: Array) -> tuple[float, float]:
     """Return the root of the sum of squares of each array: infinite or NaN if a value is, or if squares overflow."""
     positions = xy.ravel()
     with np.errstate(over="ignore"):
-        return math.sqrt(positions @ positions), math.sqrt(brightness @ brightness)
+        return math.sqrt(np.sum(square(positions))), math.sqrt(np.sum(square(brightness)))
 
 
 def _is_finite(array: Array, magnitude: float) -> bool:
@@ -130,8 +131,8 @@ class CheckedDetections(NamedTuple):
         slope = self.sigmas[:, 2]
         if not slope.any():
             return np.ascontiguousarray(self.sigmas[:, :2])
-        first, second = self.sigmas[:, :2].T ** 2 / (1.0 + slope * slope)
-        xx, yy, xy = first + second * slope**2, first * slope**2 + second, (first - second) * slope
+        first, second = square(self.sigmas[:, :2].T) / (1.0 + slope * slope)
+        xx, yy, xy = first + second * square(slope), first * square(slope) + second, (first - second) * slope
         return np.asarray(np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2))
 
     @classmethod

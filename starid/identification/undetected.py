@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from starid.arrays import Array, Indices32, Mask
 from starid.camera import Camera
 from starid.catalog import StarCatalog
+from starid.elementary import square
 from starid.errors import StaridError
 from starid.identification.solution import Solution
 
@@ -81,7 +82,7 @@ def missing_stars(
     if len(detections):
         for row in np.flatnonzero(~is_detected):
             gap = detections - xy[row]
-            is_detected[row] = bool(np.min(np.einsum("ij,ij->i", gap, gap)) < radius_px * radius_px)
+            is_detected[row] = bool(np.min(np.sum(square(gap), axis=1)) < radius_px * radius_px)
     magnitude = stars.v[near]
     limit = _complete_to(magnitude, is_detected)
     lost = np.flatnonzero(~is_detected & (magnitude <= limit))

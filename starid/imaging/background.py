@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -10,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array32, GreyImage
+from starid.elementary import square
 from starid.errors import StaridError
 from starid.kernels.jit import compiled_ieee, inner
 
@@ -19,7 +21,7 @@ BLOCK_PX: Final = 32
 WIDEST_BLOCK_PX: Final = 64
 """Largest side of a block, pixels."""
 
-MIN_NOISE_DN: Final = 12.0**-0.5
+MIN_NOISE_DN: Final = 1.0 / math.sqrt(12.0)
 """Standard deviation of rounding to whole counts."""
 
 _ROW_STEP: Final = 4
@@ -112,7 +114,7 @@ def _refine(values: Array32, dx: Array32, dy: Array32, start: tuple[float, float
         if lean2 > np.float32(0.0):
             across += lean / lean2
             explained += lean * lean / (lean2 * kept)
-        sigma = np.sqrt(max(squares / kept - explained, np.float32(MIN_NOISE_DN**2)))
+        sigma = np.sqrt(max(squares / kept - explained, np.float32(square(MIN_NOISE_DN))))
     plane[0], plane[1], plane[2], plane[3] = level, along, across, sigma
 
 

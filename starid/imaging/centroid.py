@@ -15,6 +15,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from starid.arrays import Array, Array32, record_type
+from starid.elementary import hypot
 from starid.imaging.normal_table import normal, quick_normal
 from starid.kernels.jit import compiled_ieee
 
@@ -132,7 +133,7 @@ def trail_model(
     counts as 1/12 square pixel more of the spot's variance. The loop has no branch, so it is vectorised.
     """
     left, top, columns, rows = window
-    length = math.hypot(trail[0], trail[1])
+    length = hypot(trail[0], trail[1])
     inverse = 1.0 / math.sqrt(sigma * sigma + _PIXEL_VARIANCE)
     along_x, along_y = trail[0] / length * inverse, trail[1] / length * inverse
     half = 0.5 * length * inverse
@@ -165,7 +166,7 @@ def star_model(
     work: Array,
 ) -> None:
     """Model of a round spot or of a trail, depending on the shape (sigma, trail x, trail y)."""
-    if math.hypot(shape[1], shape[2]) > SHORT_TRAIL_PX:
+    if hypot(shape[1], shape[2]) > SHORT_TRAIL_PX:
         trail_model(x, y, shape[0], (shape[1], shape[2]), window, model)
     else:
         spot_model(x, y, shape[0], window, model, work)

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask, Records
+from starid.elementary import square
 from starid.errors import StaridError
 from starid.imaging.background import Background, estimate_background
 from starid.imaging.centroid import (
@@ -210,7 +211,7 @@ class Detections:
     @property
     def sigma_px(self) -> Array:
         """Errors (n,) of the position, root mean square of both axes."""
-        return np.asarray(np.sqrt(np.mean(self.xy_sigma_px**2, axis=1)), dtype=np.float64)
+        return np.asarray(np.sqrt(np.mean(square(self.xy_sigma_px), axis=1)), dtype=np.float64)
 
     @property
     def position_errors(self) -> Array:
@@ -486,7 +487,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
     counts, background, settings = scene.counts, scene.background, scene.settings
     peaks, heights = peaks[: 2 * settings.max_stars], heights[: 2 * settings.max_stars]
     per_dn = 0.0 if settings.gain_e_per_dn is None else 1.0 / settings.gain_e_per_dn
-    flux = heights / np.float32(noise_factor(spot_taps(shape.sigma_px)) ** 2)
+    flux = heights / np.float32(square(noise_factor(spot_taps(shape.sigma_px))))
     count = len(peaks)
     windows = np.zeros(count, WINDOW)
     spot = (shape.sigma_px, scene.saturation, background.median_noise)
@@ -553,10 +554,10 @@ def _shift_by_edge(scene: _Scene, fits: _Fits, good: Indices, sigma_px: float) -
     explain.
     """
     background, settings, windows = scene.background, scene.settings, fits.windows[good]
-    explained = np.full(len(windows), background.median_noise**2)
+    explained = np.full(len(windows), square(background.median_noise))
     if settings.gain_e_per_dn is not None:
         explained += np.maximum(windows["base"] - background.median_level, 0.0) / settings.gain_e_per_dn
-    rest = windows["noise"] ** 2 - explained
+    rest = square(windows["noise"]) - explained
     step = _STEP_PER_SPREAD * np.sqrt(np.where(rest > explained, rest, 0.0))
     ends = windows["offset"] + windows["columns"] * windows["rows"]
     for k, (begin, end, sky2) in enumerate(zip(windows["offset"], ends, explained, strict=True)):
@@ -564,10 +565,10 @@ def _shift_by_edge(scene: _Scene, fits: _Fits, good: Indices, sigma_px: float) -
         darkest = -float(np.partition(pixels, _DARK_PIXELS - 1)[_DARK_PIXELS - 1])
         if darkest > _DARK_SIGMA * math.sqrt(sky2):
             step[k] = max(step[k], darkest)
-    trail = np.hypot(windows["trail_x"], windows["trail_y"])
-    reach = np.hypot(trail, 4.0 / np.sqrt(2.0 * np.pi) * sigma_px)
+    trail2 = square(windows["trail_x"]) + square(windows["trail_y"])
+    reach = np.sqrt(trail2 + square(4.0 / math.sqrt(2.0 * math.pi) * sigma_px))
     flux = fits.stars["flux"][good]
-    return np.asarray(2.0 * np.pi * sigma_px**2 * reach * step / flux, dtype=np.float64)
+    return np.asarray(2.0 * math.pi * square(sigma_px) * reach * step / flux, dtype=np.float64)
 
 
 def _shift_by_hidden_stars(flux: Array, length: Array, sigma_px: float, size: tuple[int, int]) -> Array:
@@ -579,11 +580,11 @@ def _shift_by_hidden_stars(flux: Array, length: Array, sigma_px: float, size: tu
     image, are ``2 π √(2π) L s³`` and ``⅔ √(2π) L s³`` times Σ f²/(F² A), where the sum is over the stars of area A that are
     faint enough.
     """
-    width = math.sqrt(sigma_px**2 + 1.0 / 12.0)
+    width2 = square(sigma_px) + 1.0 / 12.0
     fainter = np.where(flux[None, :] < _UNRESOLVED_SHARE * flux[:, None], flux[None, :], 0.0)
-    squares = np.sum(fainter**2, axis=1) / (flux**2 * size[0] * size[1])
-    both = math.sqrt(2.0 * math.pi) * width**3 * np.array([2.0 * math.pi, 2.0 / 3.0])
-    return np.sqrt((squares * length)[:, None] * both)
+    squares = np.sum(square(fainter), axis=1) / (square(flux) * size[0] * size[1])
+    both = math.sqrt(2.0 * math.pi * width2) * width2 * np.array([2.0 * math.pi, 2.0 / 3.0])
+    return np.asarray(np.sqrt((squares * length)[:, None] * both), dtype=np.float64)
 
 
 def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detections:
@@ -602,7 +603,7 @@ def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detecti
     for variance in ("var_x", "var_y", "cov_xy", "var_flux"):
         stars[variance] *= np.where(is_bad, misfit, 1.0)
     doubt_close_pairs(stars, np.argsort(-stars["y"], kind="stable"), settings.blend_px)
-    uneven = _shift_by_edge(scene, fits, good, shape.sigma_px) ** 2
+    uneven = square(_shift_by_edge(scene, fits, good, shape.sigma_px))
     stars["var_x"] += uneven
     stars["var_y"] += uneven
     unit = 1.0 if settings.gain_e_per_dn is None else settings.gain_e_per_dn
@@ -611,14 +612,14 @@ def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detecti
         size = (scene.counts.shape[1], scene.counts.shape[0])
         shifts, trails = trail_shifts(shape.flow, middle, size, shape.sigma_px, shape.trail_px)
         middle -= shifts
-        length2 = np.sum(trails**2, axis=1)
-        cut = np.where(marks & AT_EDGE, _CUT_TRAIL_ERROR, 0.0) ** 2 * length2
-        hidden = _shift_by_hidden_stars(stars["flux"], np.sqrt(length2), shape.sigma_px, size) ** 2
+        length2 = np.sum(square(trails), axis=1)
+        cut = square(np.where(marks & AT_EDGE, _CUT_TRAIL_ERROR, 0.0)) * length2
+        hidden = square(_shift_by_hidden_stars(stars["flux"], np.sqrt(length2), shape.sigma_px, size))
         # along and across: the same in all directions, and more along the trail
         across = cut + hidden[:, 1]
-        more = _TRAIL_ERROR**2 + (hidden[:, 0] - hidden[:, 1]) / np.maximum(length2, 1.0)
-        stars["var_x"] += more * trails[:, 0] ** 2 + across
-        stars["var_y"] += more * trails[:, 1] ** 2 + across
+        more = square(_TRAIL_ERROR) + (hidden[:, 0] - hidden[:, 1]) / np.maximum(length2, 1.0)
+        stars["var_x"] += more * square(trails[:, 0]) + across
+        stars["var_y"] += more * square(trails[:, 1]) + across
         stars["cov_xy"] += more * trails[:, 0] * trails[:, 1]
     sigmas = np.sqrt(np.column_stack([stars["var_x"], stars["var_y"]]))
     return Detections(

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from starid.arrays import GreyImage
 from starid.errors import StaridError
+from starid.matrices import product
 from starid.storage.files import MEGABYTE, is_stream, read_bytes, write_atomically
 
 IMAGE_LIMIT: Final = 1000 * MEGABYTE
@@ -84,7 +85,7 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> GreyImage:
 
 def grey_of(pixels: NDArray[Any]) -> NDArray[Any]:
     """Luma (h, w) of an image (h, w, 3 or 4) in BGR order, of the same type; alpha is dropped."""
-    grey: NDArray[Any] = np.rint(pixels[:, :, :3] @ _GREY_WEIGHTS).astype(pixels.dtype)
+    grey: NDArray[Any] = np.rint(product(pixels[:, :, :3], _GREY_WEIGHTS)).astype(pixels.dtype)
     return grey
 
 

@@ -14,7 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array32, GreyImage, Indices32
+from starid.elementary import square
 from starid.imaging.background import block_position
+from starid.imaging.normal_table import distribution
 from starid.kernels.jit import compiled_ieee
 from starid.kernels.small_arrays import zero
 
@@ -28,7 +30,6 @@ _SOFT_TAPS: Final = np.array([6, 4, 1], dtype=np.uint16)
 _LINE_STEP: Final = 4
 _GROUP: Final = 32
 _HALF_WIDTH_SIGMA: Final = 2.2
-_SQRT_HALF: Final = math.sqrt(0.5)
 
 
 @lru_cache(maxsize=4)
@@ -38,15 +39,15 @@ def spot_taps(sigma_px: float) -> Array32:
     Shared between calls: not to be changed.
     """
     reach = max(1, math.floor(_HALF_WIDTH_SIGMA * sigma_px + 0.5))
-    edges = (np.arange(reach + 2) - 0.5) / sigma_px * _SQRT_HALF
-    shares = np.diff([math.erf(edge) for edge in edges])
+    edges = (np.arange(reach + 2) - 0.5) / sigma_px
+    shares = np.diff([distribution(edge) for edge in edges.tolist()])
     taps: Array32 = (shares / (shares[0] + 2.0 * shares[1:].sum())).astype(np.float32)
     return taps
 
 
 def noise_factor(taps: npt.NDArray[np.floating]) -> float:
     """Ratio of the noise of the smoothed image to the noise of a pixel."""
-    return float(taps[0] ** 2 + 2.0 * np.sum(taps[1:] ** 2, dtype=np.float64))
+    return float(square(taps[0]) + 2.0 * np.sum(square(taps[1:]), dtype=np.float64))
 
 
 def integer_taps(sigma_px: float) -> npt.NDArray[np.uint16] | None:
@@ -324,7 +325,7 @@ def find_peaks_in_bytes(
     lines = np.empty((2, width), np.float32)
     limit = np.empty(width, np.uint16)
     flags = np.empty(-(-width // _GROUP), np.uint8)
-    scale = np.float32(INTEGER_TAPS_SUM**2)
+    scale = np.float32(square(INTEGER_TAPS_SUM))
     highest = np.int32(65535)
     count = zero()
     line = -1

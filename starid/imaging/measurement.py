@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array, Array32, Indices, Indices32, Mask, Records
+from starid.elementary import hypot
 from starid.imaging.centroid import (
     FAINT,
     GOOD,
@@ -144,7 +145,7 @@ def _is_at_rest(
 ) -> bool:
     """Whether a spot at rest fits and the trail of a star does not; `spot` is workspace for its fit."""
     bad = BAD_FIT * (star.pixels - FIT_PARAMETERS)
-    if star.state != GOOD or star.chi2 <= bad or math.hypot(shape[1], shape[2]) <= SHORT_TRAIL_PX:
+    if star.state != GOOD or star.chi2 <= bad or hypot(shape[1], shape[2]) <= SHORT_TRAIL_PX:
         return False
     fit_star(pixels, bounds, (star.x, star.y), (shape[0], 0.0, 0.0), noise, 0.0, model, work, spot)
     return bool(spot.state == GOOD and spot.chi2 <= min(bad, _REST_CHI2_SHARE * star.chi2))
@@ -165,7 +166,7 @@ def _classify_fit(
     """Return GOOD for a star, or the reason to reject the fit."""
     width, height = size
     noise, patch = window.noise, window.patch
-    length = math.hypot(window.trail_x, window.trail_y)
+    length = hypot(window.trail_x, window.trail_y)
     if not star.flux > 0.0:
         return FAINT
     if not (-0.5 <= star.x < width - 0.5 and -0.5 <= star.y < height - 0.5):
@@ -181,7 +182,7 @@ def _classify_fit(
     if not lit[1] <= bright <= lit[2]:
         return WRONG_SIZE
     allowed = _WANDER_PX * max(sigma, 1.0) + patch + 0.5 * length
-    if math.hypot(star.x - window.start_x, star.y - window.start_y) > allowed:
+    if hypot(star.x - window.start_x, star.y - window.start_y) > allowed:
         return WANDERED
     if patch > 0.0:
         # the wings must imply a saturated core

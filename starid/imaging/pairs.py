@@ -9,6 +9,7 @@ import numpy as np
 
 from starid.arrays import Array, Array32, Indices, Indices32, Mask, Records
 from starid.catalog.photometry import EVEN_PAIR
+from starid.elementary import exp, hypot, square
 from starid.imaging.centroid import (
     FIT,
     GOOD,
@@ -169,7 +170,7 @@ def _first_guesses(
     for j in range(1, rows - 1):
         for i in range(1, columns - 1):
             off_x, off_y = left + i - star.x, top + j - star.y
-            if math.hypot(off_x, off_y) < _CORE_SIGMA * sigma:
+            if hypot(off_x, off_y) < _CORE_SIGMA * sigma:
                 continue
             total = 0.0
             for b in range(-1, 2):
@@ -179,7 +180,7 @@ def _first_guesses(
                 best, best_x, best_y = total, off_x, off_y
     if best <= 0.0:
         return False
-    distance = math.hypot(best_x, best_y)
+    distance = hypot(best_x, best_y)
     pair[0] = star
     pair[1] = star
     if distance > _FAR_SIGMA * sigma:
@@ -200,7 +201,7 @@ def _first_guesses(
 @compiled_ieee
 def _is_better(pair: Records, chi2: float, sigma: float, models: Array, pixels: Array32) -> bool:
     """Whether two stars fit much better than one, and neither is noise or a single pixel."""
-    apart = math.hypot(pair[0].x - pair[1].x, pair[0].y - pair[1].y)
+    apart = hypot(pair[0].x - pair[1].x, pair[0].y - pair[1].y)
     if pair[0].chi2 > _CHI2_SHARE * chi2 or apart < _CLOSEST_SIGMA * sigma:
         return False
     total = pair[0].flux + pair[1].flux
@@ -222,8 +223,8 @@ def _is_better(pair: Records, chi2: float, sigma: float, models: Array, pixels: 
 @compiled_ieee
 def _blend_shift(off_x: float, off_y: float, ratio: float, blend_px: float) -> float:
     """Where a single spot fits between a star and its companion, as a share of their distance."""
-    gaussian = math.exp(-(off_x * off_x + off_y * off_y) / (blend_px * blend_px))
-    share = 1.0 - (1.0 - gaussian) * max(1.0 - (ratio / EVEN_PAIR) ** 2, 0.0)
+    gaussian = exp(-(off_x * off_x + off_y * off_y) / (blend_px * blend_px))
+    share = 1.0 - (1.0 - gaussian) * max(1.0 - square(ratio / EVEN_PAIR), 0.0)
     return share * ratio / (1.0 + ratio)
 
 
@@ -256,8 +257,8 @@ def doubt_close_pairs(stars: Records, order: Indices, blend_px: float) -> None:
             if ratio > 1.0:
                 brighter, ratio = other, 1.0 / ratio
             shift = _blend_shift(off_x, off_y, ratio, blend_px)
-            brighter.var_x += (shift * off_x) ** 2
-            brighter.var_y += (shift * off_y) ** 2
+            brighter.var_x += square(shift * off_x)
+            brighter.var_y += square(shift * off_y)
             brighter.cov_xy += shift * shift * off_x * off_y
 
 
@@ -359,14 +360,14 @@ def split_pairs(
             left_over[i] = target[i] - star.flux * models[0, i] if target[i] < UNUSABLE else 0.0
         if not _first_guesses(left_over, bounds, star, sigma, pair):
             continue
-        noises = (window.noise**2, per_dn, model_error)
+        noises = (square(window.noise), per_dn, model_error)
         enough = _CHI2_SHARE * star.chi2
         fitted = fit_pair(target, bounds, shape, noises, models, work, enough, pair)
         if not fitted or not _is_better(pair, star.chi2, sigma, models, target):
             continue
         todo[k] = False
         faint = 1 if pair[1].flux < pair[0].flux else 0
-        if math.hypot(pair[0].x - pair[1].x, pair[0].y - pair[1].y) < blend_px:
+        if hypot(pair[0].x - pair[1].x, pair[0].y - pair[1].y) < blend_px:
             _merge(pair, blend_px, star)
             continue
         stars[k] = pair[1 - faint]

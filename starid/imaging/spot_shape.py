@@ -13,7 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Array32, GreyImage, Indices32, Mask
+from starid.arrays import Array, Array32, GreyImage, Indices32, Mask, interpolated
+from starid.elementary import square
 from starid.imaging.background import interpolate_at, median
 from starid.imaging.normal_table import gaussian
 from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, lengths_and_mismatches
@@ -27,6 +28,8 @@ _WEIGHT_END: Final = 12.0
 _MIN_FOR_SPOT: Final = 3
 _ROUND_BELOW_PX: Final = 1.0
 _MIN_SIGMA_PX: Final = 0.3
+_LEAST_SPLIT: Final = 1e-300
+_SERIES_END: Final = 101
 _MISMATCH_SHARE: Final = 0.4
 _LONG_PX: Final = 2.5
 _MIN_LONG: Final = 6
@@ -207,8 +210,8 @@ def shape_from_moments(
     if len(table) < _MIN_FOR_SPOT:
         return SpotShape(known_sigma_px or assumed_sigma_px, still, 0.0, 0)
     mean, split = _mean_and_split(table)
-    across = known_sigma_px**2 + _PIXEL_VARIANCE if known_sigma_px else median(mean - split)
-    across = max(across, _MIN_SIGMA_PX**2 + _PIXEL_VARIANCE)
+    across = square(known_sigma_px) + _PIXEL_VARIANCE if known_sigma_px else median(mean - split)
+    across = max(across, square(_MIN_SIGMA_PX) + _PIXEL_VARIANCE)
     # for a short trail of length L the split is L²/24
     if math.sqrt(24.0 * median(split)) > _ROUND_BELOW_PX:
         positions, trails, length = _trails(table, width, height, across)
@@ -224,7 +227,7 @@ def shape_from_moments(
 def long_trails(table: Array, sigma_px: float) -> Mask:
     """Mask (n,) of the stars, in a table of moments, too elongated for noise or a close neighbour."""
     mean, split = _mean_and_split(table)
-    return np.asarray(trail_length(mean + split, sigma_px**2 + _PIXEL_VARIANCE) > _LONG_PX, dtype=bool)
+    return np.asarray(trail_length(mean + split, square(sigma_px) + _PIXEL_VARIANCE) > _LONG_PX, dtype=bool)
 
 
 def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) -> SpotShape:
@@ -243,7 +246,7 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
     if len(longest) < _MIN_LONG:
         return shape
     trail = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
-    positions, trails, length = _trails(longest, width, height, shape.sigma_px**2 + _PIXEL_VARIANCE)
+    positions, trails, length = _trails(longest, width, height, square(shape.sigma_px) + _PIXEL_VARIANCE)
     agree = np.count_nonzero(
         lengths_and_mismatches(trail.flow, positions, trails)[1] < _AGREEMENT_SHARE * length
     )
@@ -255,31 +258,40 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
 def _mean_and_split(table: Array) -> tuple[Array, Array]:
     """Mean (n,) and half-difference (n,) of the variances along and across each star of a table of moments."""
     c_xx, c_xy, c_yy = table[:, 2], table[:, 3], table[:, 4]
-    return 0.5 * (c_xx + c_yy), np.hypot(0.5 * (c_xx - c_yy), c_xy)
+    return 0.5 * (c_xx + c_yy), np.sqrt(square(0.5 * (c_xx - c_yy)) + square(c_xy))
 
 
 def _trails(table: Array, width: int, height: int, across: float) -> tuple[Array, Array, Array]:
     """Positions (n, 2) for `fit_flow`, trails (n, 2) and lengths (n,), given the variance across the trails."""
     mean, split = _mean_and_split(table)
     length = trail_length(mean + split, across)
-    angle = 0.5 * np.arctan2(2.0 * table[:, 3], table[:, 2] - table[:, 4])
-    trails = length[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    # half of the angle of (c_xx − c_yy, 2 c_xy)
+    difference, mixed = 0.5 * (table[:, 2] - table[:, 4]), table[:, 3]
+    size = np.maximum(split, _LEAST_SPLIT)
+    larger = np.sqrt(0.5 + 0.5 * np.abs(difference) / size)
+    smaller = 0.5 * np.abs(mixed) / (size * larger)
+    cosine = np.where(difference < 0.0, smaller, larger)
+    sine = np.copysign(np.where(difference < 0.0, larger, smaller), mixed)
+    trails = length[:, None] * np.column_stack([cosine, sine])
     positions = (table[:, :2] - 0.5 * (np.array([width, height]) - 1.0)) / (0.5 * max(width, height))
     return positions, trails, length
 
 
 def _sigma(variance: float, known: float | None) -> float:
     """Standard deviation of the spot from its variance as sampled by pixels."""
-    return known or math.sqrt(max(variance - _PIXEL_VARIANCE, _MIN_SIGMA_PX**2))
+    return known or math.sqrt(max(variance - _PIXEL_VARIANCE, square(_MIN_SIGMA_PX)))
 
 
 @lru_cache(maxsize=1)
 def _box_share() -> tuple[Array, Array]:
     """Half-length z of a box in sigmas of a Gaussian weight, and 1 − 2zφ(z)/(2Φ(z) − 1) for it."""
     z = np.linspace(1e-3, 4.0, 2000)
-    bell = np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi)
-    inside = np.array([math.erf(value / math.sqrt(2.0)) for value in z])
-    return z, 1.0 - 2.0 * z * bell / inside
+    # Φ(z) − ½ = φ(z) (z + z³/3 + z⁵/15 + …)
+    term, series = z, np.zeros_like(z)
+    for k in range(3, _SERIES_END, 2):
+        term = term * square(z) / k
+        series += term
+    return z, series / (z + series)
 
 
 def trail_length(along: Array, across: float) -> Array:
@@ -291,5 +303,5 @@ def trail_length(along: Array, across: float) -> Array:
     """
     ratio = np.maximum(along / across, 1.0)
     z, share = _box_share()
-    cut = np.interp((ratio - 1.0) / (2.0 * ratio), share, z, left=0.0)
+    cut = interpolated((ratio - 1.0) / (2.0 * ratio), np.append(0.0, share), np.append(0.0, z))
     return np.asarray(2.0 * cut * np.sqrt(ratio + 1.0) * math.sqrt(across), dtype=np.float64)

@@ -12,9 +12,11 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, GreyImage, Indices, Mask
+from starid.elementary import square
 from starid.errors import StaridError
 from starid.imaging.background import BLOCK_PX, estimate_background
 from starid.imaging.detection import Detections, DetectionSettings, detect
+from starid.matrices import lengths
 
 TILE_PX: Final = 2 * BLOCK_PX
 """Side of a tile."""
@@ -76,14 +78,14 @@ def detect_near(
     first = tile < used.size
     tile = np.where(first, tile, 0)
     xy = found.xy_px - TILE_PX * at + corners[tile]
-    distance = np.hypot(*(xy - places[used][tile]).T)
+    distance = lengths(xy - places[used][tile])
     around = first & (distance <= MAX_RADIUS_PX)
     off = xy[:, None, :] - places[None, :, :]
-    elsewhere = around & ~(np.einsum("nmk,nmk->nm", off, off) <= radius_px * radius_px).any(axis=1)
+    elsewhere = around & ~(np.sum(square(off), axis=2) <= radius_px * radius_px).any(axis=1)
     uneven = _uneven_tiles(mosaic, (rows, columns))[tile]
     alike = (found.flux >= _RIVAL_SHARE * found.flux[:, None]) & (uneven == uneven[:, None])
     count = np.count_nonzero(elsewhere & alike, axis=1)
-    rivals = count / (np.pi * (MAX_RADIUS_PX**2 - radius_px**2))
+    rivals = count / (np.pi * (square(MAX_RADIUS_PX) - square(radius_px)))
     near = np.flatnonzero(around & (distance <= radius_px))
     near = near[np.argsort(distance[near], kind="stable")]
     pixel = np.rint(xy[near]).astype(np.int64)

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array, GreyImage
+from starid.elementary import hypot, square
 from starid.imaging.matched_filter import spot_taps
 from starid.imaging.trail_flow import trail_at
 from starid.kernels.jit import compiled_ieee
@@ -64,9 +65,7 @@ def _sum_along(
 def trail_steps(flow: Array, width: int, height: int) -> int:
     """Number of positions along a trail, about a pixel apart on the longest trail in the field."""
     corners = [(x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]
-    lengths = [
-        math.hypot(*trail_at(flow, x * (width - 1), y * (height - 1), width, height)) for x, y in corners
-    ]
+    lengths = [hypot(*trail_at(flow, x * (width - 1), y * (height - 1), width, height)) for x, y in corners]
     return min(max(math.ceil(max(lengths)), 1), _MAX_STEPS)
 
 
@@ -93,9 +92,9 @@ def sum_along_trails(image: GreyImage, flow: Array, steps: int) -> tuple[npt.NDA
     if image.dtype == np.uint8:
         _sum_along(image, flow, steps, 0, np.empty(_TILE_PIXELS, np.uint16), out)
         return out, float(steps)
-    shift = math.ceil(math.log2(steps))
+    shift = (steps - 1).bit_length()
     _sum_along(image, flow, steps, shift, np.empty(_TILE_PIXELS, np.uint32), out)
-    return out, steps / 2.0**shift
+    return out, math.ldexp(steps, -shift)
 
 
 def trail_noise_factor(sigma_px: float, trail_px: float, steps: int) -> float:
@@ -104,4 +103,7 @@ def trail_noise_factor(sigma_px: float, trail_px: float, steps: int) -> float:
     spot = np.concatenate([taps[:0:-1], taps])
     offsets = np.rint(((np.arange(steps) + 0.5) / steps - 0.5) * trail_px).astype(int)
     line = np.bincount(offsets - offsets.min()) / steps
-    return float(np.sqrt(np.sum(np.convolve(spot, line) ** 2) * np.sum(spot**2)))
+    smeared = np.zeros(spot.size + line.size - 1)
+    for k, share in enumerate(line):
+        smeared[k : k + spot.size] += share * spot
+    return float(np.sqrt(np.sum(square(smeared)) * np.sum(square(spot))))

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.elementary import hypot
 from starid.imaging.normal_table import normal
 from starid.kernels.jit import compiled_ieee
 from starid.kernels.small_arrays import copy_values, median
@@ -128,8 +129,8 @@ def _rows(u: float, v: float, rows: Array) -> None:
 def _mismatch(flow: Array, positions: Array, trails: Array, k: int) -> tuple[float, float]:
     """Distance between the measured trail k and the flow's, and the sense (±1) that minimises it."""
     dx, dy = _flow_trail(flow, positions[k, 0], positions[k, 1])
-    forth = math.hypot(trails[k, 0] - dx, trails[k, 1] - dy)
-    back = math.hypot(trails[k, 0] + dx, trails[k, 1] + dy)
+    forth = hypot(trails[k, 0] - dx, trails[k, 1] - dy)
+    back = hypot(trails[k, 0] + dx, trails[k, 1] + dy)
     return (forth, 1.0) if forth <= back else (back, -1.0)
 
 
@@ -193,7 +194,7 @@ def _mean_mismatch(flow: Array, positions: Array, trails: Array) -> float:
     total = 0.0
     for k in range(positions.shape[0]):
         off, _ = _mismatch(flow, positions, trails, k)
-        total += min(off, 0.5 * math.hypot(trails[k, 0], trails[k, 1]))
+        total += min(off, 0.5 * hypot(trails[k, 0], trails[k, 1]))
     return float(total / positions.shape[0])
 
 
@@ -255,6 +256,6 @@ def lengths_and_mismatches(flow: Array, positions: Array, trails: Array) -> tupl
     off = np.empty(positions.shape[0])
     for k in range(positions.shape[0]):
         dx, dy = _flow_trail(flow, positions[k, 0], positions[k, 1])
-        lengths[k] = math.hypot(dx, dy)
+        lengths[k] = hypot(dx, dy)
         off[k], _ = _mismatch(flow, positions, trails, k)
     return lengths, off

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array, Array32, GreyImage, Indices32, Records, record_type
+from starid.elementary import cos, log, sin
 from starid.imaging.background import MIN_NOISE_DN, interpolate_at
 from starid.imaging.trail_flow import trail_at
 from starid.kernels.jit import compiled_ieee
@@ -89,7 +90,7 @@ def light_radius(sigma: float, flux: float, noise: float) -> int:
     """Half-width of the square where a star exceeds a third of the pixel noise, at least 2.5 sigma."""
     peak = flux / (2.0 * math.pi * sigma * sigma)
     ratio = max(peak / (_VISIBLE_NOISE * noise), 1.0)
-    reach = max(_MIN_REACH_SIGMA, min(math.sqrt(2.0 * math.log(ratio)), _MAX_REACH_SIGMA))
+    reach = max(_MIN_REACH_SIGMA, min(math.sqrt(2.0 * log(ratio)), _MAX_REACH_SIGMA))
     return min(max(math.ceil(reach * sigma + 0.5), 2), LARGEST_HALF_WIDTH)
 
 
@@ -298,8 +299,8 @@ def lay_windows(
     ring = np.empty(_RING_PIXELS)
     circle = np.empty((2, _RING_PIXELS))
     for k in range(_RING_PIXELS):
-        circle[0, k] = math.cos(2.0 * math.pi * k / _RING_PIXELS)
-        circle[1, k] = math.sin(2.0 * math.pi * k / _RING_PIXELS)
+        circle[0, k] = cos(2.0 * math.pi * k / _RING_PIXELS)
+        circle[1, k] = sin(2.0 * math.pi * k / _RING_PIXELS)
     visited = np.empty((2 * PATCH_REACH + 1, 2 * PATCH_REACH + 1), np.uint8)
     stack = np.empty((2 * MAX_SATURATED, 2), np.int32)
     patches = np.empty((_MAX_PATCHES, 7))

@@ -2,20 +2,27 @@
 
 A kernel is compiled, or loaded from the cache (`starid.kernels.kernel_cache`), when it is first called with arguments of certain
 types. The process that answers the bus imports no module with kernels. Sums are never reordered (no ``fastmath``), so
-that a kernel gives the same bytes on each processor. Numba lets a function inherit an option that it does not set from
-the kernel that calls it, so all set the error model.
+that a kernel gives the same bytes on each processor, and kernels call the functions of `starid.elementary` in place of those of
+`math`. Numba lets a function inherit an option that it does not set from the kernel that calls it, so all set the error model.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import FunctionType
 from typing import Final, TypeVar, cast
 
+from starid import elementary
 from starid.kernels.kernel_cache import use_kernel_cache
 
 _CACHED: Final = use_kernel_cache()  # before numba reads its environment
 
 from numba import njit  # noqa: E402
+from numba.extending import register_jitable  # noqa: E402
+
+for _function in vars(elementary).values():
+    if isinstance(_function, FunctionType):
+        register_jitable(error_model="numpy")(_function)
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 

@@ -18,7 +18,6 @@ import os
 import re
 import shutil
 import sys
-import tempfile
 import time
 import zlib
 from pathlib import Path
@@ -26,6 +25,7 @@ from typing import Final
 
 from starid.storage.cache import KERNEL_SUFFIX, cache_dir, evict, kernel_folder, mark_used
 from starid.storage.files import write_atomically
+from starid.storage.temporary_folder import locked, make_temporary_folder
 
 _log = logging.getLogger(__name__)
 
@@ -34,6 +34,8 @@ PACKAGES: Final = ("starid", "starhil/emulator/sensor")
 
 _VERSIONS: Final = ("numba", "numpy")
 _CHECKSUMS: Final = "checksums.json"
+_PATIENCE_S: Final = 5.0
+"""Longest time for which a process waits until another one has recorded its checksums, seconds."""
 _UNFINISHED_S: Final = 3600.0
 """Time after which a file without a checksum was left by a process that did not end properly, seconds."""
 
@@ -58,7 +60,8 @@ def use_kernel_cache() -> bool:
             atexit.register(record_checksums, folder, time.time())
         remove_damaged(folder)
     except OSError as error:
-        _log.warning("kernels cannot be cached (%s): each process compiles them", error)
+        why = error.args[0][0][-1] if isinstance(error, shutil.Error) else error  # of the first of all files
+        _log.warning("kernels cannot be cached (%s): each process compiles them", why)
         return False
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:  # which has read its environment already
@@ -74,8 +77,7 @@ def nothing_compiled() -> bool:
 
 def _temporary_copy(folder: Path) -> Path:
     """Copy a folder of kernels to one that is removed at the end of the process."""
-    copy = Path(tempfile.mkdtemp(prefix="starhil-kernels-"))
-    atexit.register(shutil.rmtree, copy, ignore_errors=True)
+    copy = make_temporary_folder("starhil-kernels-")
     if folder.is_dir():
         shutil.copytree(folder, copy, dirs_exist_ok=True)
     else:
@@ -105,21 +107,25 @@ def remove_damaged(folder: Path) -> None:
 
 
 def record_checksums(folder: Path, since_s: float = 0.0) -> None:
-    """Write the checksums of the files that were written since a Unix time, then keep the cache within its limit."""
-    checksums, _ = _read_checksums(folder)
-    current = {}
-    for path, name in _files(folder):
+    """Write the checksums of the files that were written since a Unix time, then keep the cache within its limit.
+
+    One process at a time does so: another one may have replaced a file since this one has read it.
+    """
+    with locked(folder, _PATIENCE_S):
+        checksums, _ = _read_checksums(folder)
+        current = {}
+        for path, name in _files(folder):
+            try:
+                known = name in checksums and path.stat().st_mtime < since_s
+                current[name] = checksums[name] if known else _checksum(path)
+            except FileNotFoundError:  # another process has replaced it
+                continue
+        if current == checksums:
+            return
         try:
-            known = name in checksums and path.stat().st_mtime < since_s
-            current[name] = checksums[name] if known else _checksum(path)
-        except FileNotFoundError:  # another process has replaced it
-            continue
-    if current == checksums:
-        return
-    try:
-        write_atomically(folder / _CHECKSUMS, lambda part: part.write_text(json.dumps(current)))
-    except OSError as error:
-        _log.warning("%s: cannot be written (%s): kernels are compiled again", folder, error.strerror)
+            write_atomically(folder / _CHECKSUMS, lambda part: part.write_text(json.dumps(current)))
+        except OSError as error:
+            _log.warning("%s: cannot be written (%s): kernels are compiled again", folder, error.strerror)
     evict(keep=folder)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import contextlib
 import logging
 import math
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.storage.files import write_atomically
+from starid.storage.temporary_folder import make_temporary_folder
 
 _log = logging.getLogger(__name__)
 
@@ -155,9 +155,7 @@ def _warn_not_used(folder: Path, problem: str) -> None:
 @cache
 def _folder_of_process() -> Path:
     """Make a folder for this process alone, which is removed at its end."""
-    folder = Path(tempfile.mkdtemp(prefix="starhil-cache-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
+    return make_temporary_folder("starhil-process-")
 
 
 def kernel_folder(key: str) -> Path | None:

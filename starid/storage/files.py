@@ -71,7 +71,9 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
     """
     with open_regular(path) as stream:
         size = os.fstat(stream.fileno()).st_size
-        content = b"" if size > limit else stream.read(limit + 1)
+        content: bytes | None = b"" if size > limit else stream.read(limit + 1)
+    if content is None:  # a file of the kernel that has nothing yet
+        raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN), str(path))
     if max(size, len(content)) > limit:
         raise OSError(errno.EFBIG, f"larger than {limit / MEGABYTE:g} MB", str(path))
     return content

@@ -23,6 +23,8 @@ from starid.attitude import Attitude
 from tests.conformance.links import LINKS, ROWS
 from tests.conformance.simulated import SimulatedUnit
 
+pytestmark = pytest.mark.long
+
 RADEC_ROLL = (211.0, 48.0, 77.0)
 TRUTH = from_radec_roll(*RADEC_ROLL)
 HALF_TURN = from_radec_roll(91.0, 0.0, 180.0)
@@ -33,6 +35,8 @@ FORMS = {
     "copy": [f"f64 copy_{part} - attitude.{part}" for part in "xyzw"],
     "vector": [f"i16 v_{part} - 0.0001 attitude.{part}" for part in "xyz"],
     "rotation": [f"f32 r_{part} deg attitude.rotation_{part}" for part in "xyz"],
+    "gibbs": [f"f32 g_{part} - attitude.gibbs_{part}" for part in "xyz"],
+    "mrp": [f"i16 p_{part} - 0.0001 attitude.mrp_{part}" for part in "xyz"],
     "radec": ["u16 ra deg 0.01 attitude.ra", "i32 dec arcsec attitude.dec", "f32 roll rad attitude.roll"],
     "boresight": ["f32 ra_2 deg attitude.ra", "f32 dec_2 deg attitude.dec"],
     **{f"dcm_{axis}": [f"f32 dcm_{axis}{n} - attitude.dcm_{axis}[{n}]" for n in (1, 2, 3)] for axis in "xyz"},

@@ -14,7 +14,9 @@ from starhil.hil_tests.errors import LinkLostError
 from tests.conformance.simulated import SimulatedUnit
 from tests.conformance.test_healthy import SUITES
 from tests.protocol.canopen.conftest import simulated_probe
-from tests.protocol.canopen.mutants import Mutant, load
+from tests.protocol.canopen.mutants import Mutant
+
+pytestmark = pytest.mark.long
 
 UNREADABLE = (
     (
@@ -44,7 +46,8 @@ UNREADABLE = (
 def test_frames_that_cannot_be_parsed_fail_their_cases_and_the_run_continues(
     mutant, caught_by, expected, seen
 ):
-    outcomes = run_cases(simulated_probe(load(mutant)), CANOPEN_CASES)
+    with mutant.planted():
+        outcomes = run_cases(simulated_probe(), CANOPEN_CASES)
     assert [outcome.id for outcome in outcomes] == [case.id for case in CANOPEN_CASES]
     caught = next(outcome for outcome in outcomes if outcome.id == caught_by)
     assert caught.status == "failed"

@@ -8,6 +8,8 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 from starhil.hil_tests.conformance.canopen_names import Names
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 
+pytestmark = pytest.mark.long
+
 MODE, EXPOSURE = 0x6000, 0x6020
 
 

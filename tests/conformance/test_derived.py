@@ -21,6 +21,8 @@ from tests.conformance.mutants_units import telemetry_data
 from tests.conformance.simulated import SimulatedUnit
 from tests.test_your_unit import written as tutorial
 
+pytestmark = pytest.mark.long
+
 SEQUENCE = """
 framing = { kind = "length", start = [0xEB, 0x90] }
 check = { kind = "crc", type = "u16", poly = 0x1021, init = 0xFFFF }

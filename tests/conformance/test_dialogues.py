@@ -17,6 +17,8 @@ from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.files.bundled import find_unit
 from tests.conformance.simulated import SimulatedUnit
 
+pytestmark = pytest.mark.long
+
 DOCS = (Path(__file__).parents[2] / "docs" / "units.md").read_text(encoding="utf-8")
 EXAMPLE = next(block.split("```")[0] for block in DOCS.split("```toml\n") if block.startswith("[[area]]"))
 AREA = '[[area]]\nname = "modes"\nlinks = ["canopen"]\nclause = "ICD 4.2"\n'

@@ -9,6 +9,8 @@ from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
 from tests.conformance.simulated import SimulatedUnit
 
+pytestmark = pytest.mark.long
+
 UNIT = read_unit("cubestar")
 SUITES = {"serial": serial_suite(UNIT), "can": can_suite(UNIT)}
 

@@ -10,6 +10,8 @@ from tests.conformance.mutant_seams import MUTANTS, Mutant
 from tests.conformance.simulated import SimulatedUnit
 from tests.conformance.test_healthy import SUITES
 
+pytestmark = pytest.mark.long
+
 _TABLES = (mutants_serial, mutants_can, mutants_requests, mutants_parts)
 """They enter their mutants in MUTANTS."""
 CASES = {case.id: case for suite in SUITES.values() for case in suite}

@@ -14,6 +14,8 @@ from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
 from tests.conformance.simulated import SimulatedUnit
 
+pytestmark = pytest.mark.long
+
 SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
 STREAMING = (("sagitta", "serial"), ("oresat", "canopen"))
 """Units that report each frame as it is published."""

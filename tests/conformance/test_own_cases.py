@@ -16,6 +16,8 @@ from starhil.protocol.files.bundled import find_unit
 from tests.conformance.links import write_unit
 from tests.conformance.simulated import SimulatedUnit
 
+pytestmark = pytest.mark.long
+
 OWN = """
 from starhil.hil_tests.conformance.case import Case, CaseArea, check_equal
 

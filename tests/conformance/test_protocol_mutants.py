@@ -16,9 +16,12 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.unit import load_unit
 from starhil.protocol.unit.examples import examine, exchanges
 from tests.conformance.links import LINKS, write_unit
-from tests.conformance.protocol_mutants import Edit, LostAimError, ProtocolMutant, read_mutants
+from tests.conformance.protocol_mutants import ProtocolMutant, read_mutants
 from tests.conformance.simulated import SimulatedUnit
+from tests.planted import Edit, LostAimError
 from tests.test_your_unit import written
+
+pytestmark = pytest.mark.long
 
 MUTANTS = read_mutants()
 SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
@@ -115,10 +118,10 @@ def test_a_unit_on_any_link_passes_every_case(link: str, order: str, tmp_path: P
 @pytest.mark.parametrize(
     "edit",
     [
-        Edit("checks:no_such_function", "a", "b"),
+        Edit("serial.checks:no_such_function", "a", "b"),
         Edit("no_such_module:crc", "a", "b"),
-        Edit("checks:crc", "no such text", "b"),
-        Edit("checks:crc", "register", "b"),
+        Edit("serial.checks:crc", "no such text", "b"),
+        Edit("serial.checks:crc", "register", "b"),
     ],
     ids=["function", "module", "text", "text that occurs several times"],
 )

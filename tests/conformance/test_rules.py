@@ -5,8 +5,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from tests.conformance.test_healthy import SUITES
+
+pytestmark = pytest.mark.long
 
 RULES = Path(__file__).parents[2] / "docs" / "rules.md"
 CASES = (*SUITES["serial"], *SUITES["can"], *CANOPEN_CASES)

@@ -10,6 +10,8 @@ from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.runner import run_case
 from tests.protocol.canopen.conftest import simulated_probe
 
+pytestmark = pytest.mark.long
+
 OPTIONAL = (0x1003, 0x1006, 0x1010, 0x1011, 0x1012, 0x1015, 0x1016, 0x1019, 0x1021)
 PDOS = range(0x1400, 0x1C00)
 OWN = range(0x2000, 0x10000)

@@ -16,6 +16,8 @@ from starhil.protocol.files.bundled import find_unit
 from starid.attitude import Attitude
 from tests.conformance.simulated import SimulatedUnit
 
+pytestmark = pytest.mark.long
+
 MUTANTS = [
     ("combination.quaternion", "unit.py", '"wxyz"', '"xyzw"'),
     ("combination.counts", "unit.py", 'struct.pack("<H", start) + stream', 'struct.pack("<H", 0) + stream'),

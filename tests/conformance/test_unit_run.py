@@ -20,6 +20,8 @@ from tests.conformance.simulated import SimulatedUnit
 from tests.conformance.test_healthy import SUITES
 from tests.protocol.canopen.conftest import simulated_probe
 
+pytestmark = pytest.mark.long
+
 FOUND = {"exposure": 500, "update_rate": 2.0, "limiting_magnitude": 5.5, "min_star_pixels": 3}
 """What a user has set and stored; it is not what the cases need."""
 IN_USE = {"exposure": 450}

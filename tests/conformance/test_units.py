@@ -23,6 +23,8 @@ from tests.conformance.mutants_units import UnitMutant, gen2, mutants
 from tests.conformance.simulated import SimulatedUnit
 from tests.conformance.test_mutants import MUTANTS
 
+pytestmark = pytest.mark.long
+
 GEN2 = "cubestar-gen2"
 UNITS = ("sagitta", "nos3", "st16", "st200", GEN2)
 SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}

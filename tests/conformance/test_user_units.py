@@ -15,6 +15,8 @@ from starhil.protocol.files.bundled import UNITS_FOLDER
 from tests.conformance.simulated import SimulatedUnit
 from tests.user_units import ON_CAN, STREAM, packets, written
 
+pytestmark = pytest.mark.long
+
 SUITES = {"serial": serial_suite, "can": can_suite}
 TRUTH = from_radec_roll(83.8, -1.2, 0.0)
 

@@ -20,6 +20,8 @@ from tests.emulator.console.pages import OPTIONS
 from tests.emulator.runs import Control
 from tests.waiting import PATIENCE_S, until
 
+pytestmark = pytest.mark.long
+
 DESCRIPTORS = 128
 CONNECTIONS = 130
 

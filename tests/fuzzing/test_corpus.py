@@ -8,6 +8,8 @@ import pytest
 
 from tests.fuzzing.targets import CORPUS, TARGETS, read_corpus
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.process] * (name == "http")) for name in TARGETS]

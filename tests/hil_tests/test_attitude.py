@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from starhil.hil_tests.attitude import (
     Quaternion,
     attitude_error,
+    attitude_in,
     from_directions,
     from_radec_roll,
     from_rotation_vector,
@@ -23,6 +25,7 @@ from starhil.hil_tests.attitude import (
     unit,
 )
 from starhil.hil_tests.errors import BenchError
+from starhil.protocol.unit import load_unit
 
 ARCSEC = math.radians(1.0 / 3600.0)
 TOLERANCE_ARCSEC = 1e-3
@@ -137,3 +140,34 @@ def test_an_attitude_follows_from_two_directions():
     known = (0.6, 0.8, 0.0), (0.0, 0.6, 0.8)
     seen = [tuple(Rotation.from_quat(attitude).apply(vector)) for vector in known]
     assert attitude_error(from_directions(seen, known), attitude).total_arcsec < TOLERANCE_ARCSEC
+
+
+FORMS = {
+    "quaternion": (["x", "y", "z", "w"], "", lambda turn: turn.as_quat(canonical=True)),
+    "vector part": (["x", "y", "z"], "", lambda turn: turn.as_quat(canonical=True)[:3]),
+    "Gibbs vector": (["gibbs_x", "gibbs_y", "gibbs_z"], "", lambda turn: turn.as_quat()[:3] / turn.as_quat()[3]),
+    "MRPs": (["mrp_x", "mrp_y", "mrp_z"], "", lambda turn: turn.as_mrp()),
+    "rotation vector": (
+        ["rotation_x", "rotation_y", "rotation_z"], 'unit = "deg", ', lambda turn: np.degrees(turn.as_rotvec())
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_the_attitude_of_a_row_is_read_in_any_form(form, tmp_path):
+    quantities, unit_of_measure, values_of = FORMS[form]
+    fields = ", ".join(
+        f'{{ name = "f{n}", type = "f64", {unit_of_measure}value = "attitude.{name}" }}'
+        for n, name in enumerate(quantities)
+    )
+    (tmp_path / "unit.toml").write_text(
+        '[unit]\nname = "x"\nversion = "1"\ndoc = "d"\n[[telemetry]]\nid = 130\nname = "row"\ndoc = "d"\nprovenance = "ours"\n'
+        f'fields = [{fields}, {{ type = "bits8", bits = [{{ name = "valid", value = "attitude.valid" }}, {{ width = 7 }}] }}]\n'
+    )  # fmt: skip
+    row = load_unit(tmp_path).telemetry["row"]
+    turn = Rotation.from_rotvec([0.3, -1.2, 0.5])
+    values = {f"f{n}": float(value) for n, value in enumerate(values_of(turn))}
+    measured = attitude_in(row, {**values, "valid": True})
+    assert tuple(measured) == pytest.approx(tuple(turn.as_quat(canonical=True)))
+    with pytest.raises(BenchError, match="not valid"):
+        attitude_in(row, {**values, "valid": False})

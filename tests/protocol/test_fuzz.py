@@ -37,6 +37,8 @@ from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
 from tests.protocol.serial.composed_links import CUBESPACE, stack_of
 
+pytestmark = pytest.mark.long
+
 INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "20000"))
 SEED = 20260103
 MAX_SIZE = 80

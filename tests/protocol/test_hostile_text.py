@@ -25,6 +25,8 @@ from starhil.protocol.icd.quoting import c_member
 from starhil.protocol.unit import load_unit
 from tests.protocol.export.c_driver import COMPILER
 
+pytestmark = pytest.mark.long
+
 HOSTILE = (
     "*/ int x; /*", "/*/ */*", "//", "??/", 'a"b', "it's", "back\\slash\\", "\\", "\\\\", "a\nb", "a\n*/\nb", "a\r\nimport os\r\n",
     "a\u2028import os\x0bb\x0cc\x85d", "\x01\x1b[31m", "]]>", "<![CDATA[", "<!--", "-->", "<script>alert(1)</script>",

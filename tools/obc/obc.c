@@ -4,7 +4,7 @@
  * attitude, reads it five times per second, and checks length and progress. It reports each reading, and ends the machine: with
  * status 0 after 25 readings that are valid, with 1 if something was wrong. The codec is `starhil icd export c`.
  */
-#include "cubestar_like.h"
+#include "cubestar.h"
 
 #include <stdarg.h>
 #include <stdio.h>
@@ -70,22 +70,22 @@ static void say(const char *format, ...)
 
 /* --- the star tracker --- */
 
-static cubestar_like_receiver_t link;
+static cubestar_receiver_t link;
 static uint32_t late, missing, slowest_ms;
 
-/* Send a request and wait for its reply; returns the kind of the message, or CUBESTAR_LIKE_NONE after a silence. */
-static int ask(uint8_t id, const uint8_t *data, size_t size, cubestar_like_message_t *message)
+/* Send a request and wait for its reply; returns the kind of the message, or CUBESTAR_NONE after a silence. */
+static int ask(uint8_t id, const uint8_t *data, size_t size, cubestar_message_t *message)
 {
-    uint8_t frame[CUBESTAR_LIKE_REQUEST_CAPACITY(CUBESTAR_LIKE_TC_SET_UNIX_TIME_SIZE)];
-    const size_t length = cubestar_like_frame_request(id, data, size, frame, sizeof frame);
+    uint8_t frame[CUBESTAR_REQUEST_CAPACITY(CUBESTAR_TC_SET_UNIX_TIME_SIZE)];
+    const size_t length = cubestar_frame_request(id, data, size, frame, sizeof frame);
     const uint32_t begin_ms = now_ms;
-    (void)cubestar_like_give_up(&link);
-    cubestar_like_expect(&link, id);
+    (void)cubestar_give_up(&link);
+    cubestar_expect(&link, id);
     send(TRACKER, frame, length);
     while (now_ms - begin_ms < SILENCE_MS) {
         if ((TRACKER->state & RX_FULL) != 0u) {
-            const int kind = (int)cubestar_like_receive(&link, (uint8_t)TRACKER->data, message);
-            if (kind != CUBESTAR_LIKE_NONE) {
+            const int kind = (int)cubestar_receive(&link, (uint8_t)TRACKER->data, message);
+            if (kind != CUBESTAR_NONE) {
                 const uint32_t took_ms = now_ms - begin_ms;
                 late += took_ms > DEADLINE_MS ? 1u : 0u;
                 slowest_ms = took_ms > slowest_ms ? took_ms : slowest_ms;
@@ -94,7 +94,7 @@ static int ask(uint8_t id, const uint8_t *data, size_t size, cubestar_like_messa
         }
     }
     ++missing;
-    return CUBESTAR_LIKE_NONE;
+    return CUBESTAR_NONE;
 }
 
 /* Discard what arrives until the line is quiet: replies to requests from before the star tracker had booted. */
@@ -110,41 +110,41 @@ static void drain(void)
 
 static bool command(uint8_t id, const uint8_t *data, size_t size)
 {
-    cubestar_like_message_t message;
-    return ask(id, data, size, &message) == CUBESTAR_LIKE_ACK;
+    cubestar_message_t message;
+    return ask(id, data, size, &message) == CUBESTAR_ACK;
 }
 
 static bool set_time(uint32_t unix_s)
 {
-    cubestar_like_tc_set_unix_time_t values = CUBESTAR_LIKE_TC_SET_UNIX_TIME_INIT;
-    uint8_t data[CUBESTAR_LIKE_TC_SET_UNIX_TIME_SIZE];
+    cubestar_tc_set_unix_time_t values = CUBESTAR_TC_SET_UNIX_TIME_INIT;
+    uint8_t data[CUBESTAR_TC_SET_UNIX_TIME_SIZE];
     values.seconds = unix_s;
-    return cubestar_like_tc_set_unix_time_encode(&values, data) == CUBESTAR_LIKE_OK
-        && command(CUBESTAR_LIKE_TC_SET_UNIX_TIME_ID, data, sizeof data);
+    return cubestar_tc_set_unix_time_encode(&values, data) == CUBESTAR_OK
+        && command(CUBESTAR_TC_SET_UNIX_TIME_ID, data, sizeof data);
 }
 
 static bool find_attitude(void)
 {
-    cubestar_like_tc_set_mode_t values = CUBESTAR_LIKE_TC_SET_MODE_INIT;
-    uint8_t data[CUBESTAR_LIKE_TC_SET_MODE_SIZE];
-    values.mode = CUBESTAR_LIKE_COMMANDED_MODE_LOST_IN_SPACE;
-    return cubestar_like_tc_set_mode_encode(&values, data) == CUBESTAR_LIKE_OK
-        && command(CUBESTAR_LIKE_TC_SET_MODE_ID, data, sizeof data);
+    cubestar_tc_set_mode_t values = CUBESTAR_TC_SET_MODE_INIT;
+    uint8_t data[CUBESTAR_TC_SET_MODE_SIZE];
+    values.mode = CUBESTAR_COMMANDED_MODE_LOST_IN_SPACE;
+    return cubestar_tc_set_mode_encode(&values, data) == CUBESTAR_OK
+        && command(CUBESTAR_TC_SET_MODE_ID, data, sizeof data);
 }
 
-static bool read_attitude(cubestar_like_tlm_precise_attitude_t *attitude)
+static bool read_attitude(cubestar_tlm_precise_attitude_t *attitude)
 {
-    cubestar_like_message_t message;
-    return ask(CUBESTAR_LIKE_TLM_PRECISE_ATTITUDE_ID, NULL, 0u, &message) == CUBESTAR_LIKE_TELEMETRY
-        && cubestar_like_tlm_precise_attitude_decode(message.data, message.size, attitude) == CUBESTAR_LIKE_OK;
+    cubestar_message_t message;
+    return ask(CUBESTAR_TLM_PRECISE_ATTITUDE_ID, NULL, 0u, &message) == CUBESTAR_TELEMETRY
+        && cubestar_tlm_precise_attitude_decode(message.data, message.size, attitude) == CUBESTAR_OK;
 }
 
 int main(void)
 {
-    cubestar_like_tlm_precise_attitude_t attitude;
+    cubestar_tlm_precise_attitude_t attitude;
     uint32_t valid = 0u, wrong = 0u, due_ms = 0u, frame = 0u;
     start_board();
-    cubestar_like_receiver_init(&link, CUBESTAR_LIKE_DIALECT_B);
+    cubestar_receiver_init(&link, CUBESTAR_DIALECT_B);
     say("boot\n");
     while (!(set_time(UNIX_S) && find_attitude()) && now_ms < LIMIT_MS) { /* the star tracker may boot later */
         drain();

@@ -17,6 +17,7 @@ from starhil.emulator.sensor.sky.objects import SkyObjects
 from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import Camera
+from starid.matrices import lengths
 
 _BRIGHTEST: Final = 200
 """Number of a frame's stars that are looked for; detections of other light rarely coincide with so few."""
@@ -49,7 +50,7 @@ def stars_seen(stars_xy: Array, detections_xy: Array) -> int:
 def near_any(xy: Array, others_xy: Array) -> Mask:
     """Return which positions (n, 2) are those of a star and its detection together with one of the others (m, 2)."""
     offsets = xy[:, None] - others_xy
-    return np.asarray((np.hypot(offsets[..., 0], offsets[..., 1]) <= SEEN_PX).any(axis=1), dtype=np.bool_)
+    return np.asarray((lengths(offsets) <= SEEN_PX).any(axis=1), dtype=np.bool_)
 
 
 def with_bodies(result: FrameResult, in_field: tuple[str, ...], *, enough_stars: bool) -> FrameResult:

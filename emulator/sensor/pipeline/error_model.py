@@ -9,7 +9,8 @@ of a frame depends only on the request and the seed:
   by more than `validation_margin` pixels within the field fails with `no_match`; a predicted attitude beyond
   `tracking_margin` plus `search_width` pixels fails with `prediction_lost`.
 - Otherwise the brightest `REPORTED_STARS` are somewhere in the field, measured with the error of a centroid; their
-  numbers and magnitudes are chance. Each axis of the attitude's error is normal, cut off at `LARGEST_SIGMA`, with the stated standard deviation.
+  numbers and magnitudes are chance. Each axis of the attitude's error is normal, cut off at `LARGEST_SIGMA`, with the
+  stated standard deviation.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from starhil.emulator.sensor.pipeline.messages import (
 )
 from starhil.emulator.sensor.star_count import STARS_TO_V6, mean_stars
 from starhil.emulator.simulation.signal import Signal
+from starid.elementary import acos, hypot, log10, square
 
 ARCSEC: Final = math.radians(1.0 / 3600.0)
 
@@ -181,10 +183,10 @@ class ErrorModel:
         settings = request.settings
         x, y, z = request.truth.rate_rad_s.tolist()
         trail_px = (
-            self._focal_px * math.hypot(x, y) + ROLL_ARM * self._camera.width * abs(z)
+            self._focal_px * hypot(x, y) + ROLL_ARM * self._camera.width * abs(z)
         ) * request.exposure_s
         light = request.exposure_s / 0.1 * request.gain * 5.0 / settings.detection_threshold
-        reach = LIMIT_V + 2.5 * math.log10(light / (1.0 + trail_px / SMEAR_PX))
+        reach = LIMIT_V + 2.5 * log10(light / (1.0 + trail_px / SMEAR_PX))
         faintest = min(reach, settings.limiting_magnitude)
         seen = 1.0 - float(request.faults.get("blocked_share", 0.0))
         return mean_stars(self._constants, faintest) * seen
@@ -209,14 +211,16 @@ class ErrorModel:
         settings, constants = request.settings, self._constants
         k1, k2, p1, p2, _ = constants["distortion"]
         edge = 0.5 * self._camera.width / self._focal_px
-        turn = math.hypot(
+        turn = hypot(
             settings.centroid_x - constants["centre_px"][0], settings.centroid_y - constants["centre_px"][1]
         )
-        radial = settings.focal_length * (1.0 + settings.k1 * edge**2 + settings.k2 * edge**4)
-        true_radial = self._focal_px * (1.0 + k1 * edge**2 + k2 * edge**4)
-        tangential = self._focal_px * math.hypot(settings.p1 - p1, settings.p2 - p2) * edge**2
+        radial = settings.focal_length * (
+            1.0 + settings.k1 * square(edge) + settings.k2 * square(square(edge))
+        )
+        true_radial = self._focal_px * (1.0 + k1 * square(edge) + k2 * square(square(edge)))
+        tangential = self._focal_px * hypot(settings.p1 - p1, settings.p2 - p2) * square(edge)
         # a shift of the centre is nearly a rotation; what remains is its projection
-        error_px: float = abs(radial - true_radial) * edge + 3.0 * tangential + turn * edge**2
+        error_px: float = abs(radial - true_radial) * edge + 3.0 * tangential + turn * square(edge)
         return error_px
 
 
@@ -225,14 +229,14 @@ def turned(attitude: Quaternion, turn_rad: list[float]) -> Quaternion:
     a, b, c = (-0.5 * component for component in turn_rad)
     x, y, z, w = attitude
     d = 1.0
-    product = (
+    a, b, c, d = (
         d * x + a * w + b * z - c * y,
         d * y - a * z + b * w + c * x,
         d * z + a * y - b * x + c * w,
         d * w - a * x - b * y - c * z,
     )
-    length = math.copysign(math.hypot(*product), product[3])
-    return (product[0] / length, product[1] / length, product[2] / length, product[3] / length)
+    length = math.copysign(math.sqrt(a * a + b * b + c * c + d * d), d)
+    return (a / length, b / length, c / length, d / length)
 
 
 def unit_vector(x: float, y: float, z: float) -> Triple:
@@ -256,4 +260,4 @@ def in_icrs(vector: Triple, attitude: Quaternion) -> Triple:
 
 def angle_between(one: Quaternion, other: Quaternion) -> float:
     """Return the angle between two attitudes, radians."""
-    return 2.0 * math.acos(min(1.0, abs(sum(a * b for a, b in zip(one, other, strict=True)))))
+    return 2.0 * acos(min(1.0, abs(math.fsum(a * b for a, b in zip(one, other, strict=True)))))

@@ -119,7 +119,7 @@ def camera_constants(camera: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parameters of a unit that is calibrated to a camera: focal length, centre and distortion, in pixels."""
     focal_x, focal_y = camera["focal_px"]
     names = ("focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2")
-    values = ((focal_x * focal_y) ** 0.5, *camera["centre_px"], *camera["distortion"][:4])
+    values = (math.sqrt(focal_x * focal_y), *camera["centre_px"], *camera["distortion"][:4])
     return dict(zip(names, values, strict=True))
 
 

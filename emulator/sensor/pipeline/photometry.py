@@ -12,12 +12,13 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.special import expit
 
 from starhil.emulator.sensor.renderer import Frame
-from starid.arrays import Array, Mask
+from starid.arrays import Array, Mask, elementwise
 from starid.attitude import Attitude, random_attitude
+from starid.elementary import exp, log, log10, square
 from starid.imaging.detection import Detections
+from starid.matrices import inverse, lengths, product, sum_of_products
 
 FIELDS: Final = 96
 """Number of fields rendered."""
@@ -38,7 +39,7 @@ _LAST: Final = 200
 _UNKNOWN_SIGMA: Final = 0.1
 _RENDERED_SHARE: Final = 0.99
 """Share of the stars within the faintest magnitude rendered; the others are companions of brighter stars."""
-_ODDS: Final = math.log(FOUND_SHARE / (1.0 - FOUND_SHARE))
+_ODDS: Final = log(FOUND_SHARE / (1.0 - FOUND_SHARE))
 _STEEPEST: Final = 100.0
 """Standard deviation of the prior of the slope, 1/mag."""
 _STEPS: Final = 30
@@ -81,19 +82,19 @@ def _compared(frame: Frame, detections: Detections, zero_e: float) -> tuple[Arra
     xy = frame.stars.xy_px
     inside = frame.stars.visible & (frame.stars.electrons > 0.0)
     inside &= (np.minimum(xy, np.array([width - 1, height - 1]) - xy) > _EDGE_PX).all(axis=1)
-    xy, true = xy[inside], -2.5 * np.log10(frame.stars.electrons[inside] / zero_e)
+    xy, true = xy[inside], -2.5 * elementwise(log10, frame.stars.electrons[inside] / zero_e)
     order = np.argsort(true, kind="stable")
     xy, true = xy[order], true[order]
-    apart = np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))
+    apart = lengths(xy[:, None] - xy[None])
     alone = ~(np.tril(apart < _BLEND_PX, -1)).any(axis=1)  # no brighter star of which it would be a part
     xy, true = xy[alone], true[alone]
     error = np.full(true.size, np.nan)
     if len(detections.flux) and len(xy):
-        distance = np.hypot(*(xy[:, None] - detections.xy_px[None]).transpose(2, 0, 1))
+        distance = lengths(xy[:, None] - detections.xy_px[None])
         nearest = distance.argmin(axis=1)
         seen = distance[np.arange(len(xy)), nearest] < _MATCH_PX
         flux = np.maximum(detections.flux[nearest[seen]], 1.0)
-        error[seen] = -2.5 * np.log10(flux / zero_e) - true[seen]
+        error[seen] = -2.5 * elementwise(log10, flux / zero_e) - true[seen]
     return true, error
 
 
@@ -116,12 +117,11 @@ def _fitted_curve(magnitude: Array, found: Mask) -> tuple[float, float]:
     """
     middle = float(magnitude.mean())
     design = np.column_stack([np.ones(magnitude.size), magnitude - middle])
-    curve, prior = np.zeros(2), np.diag([0.0, 1.0 / _STEEPEST**2])
+    curve, prior = np.zeros(2), np.diag([0.0, 1.0 / square(_STEEPEST)])
     for _ in range(_STEPS):
-        share = expit(design @ curve)
+        share = 1.0 / (1.0 + elementwise(exp, -product(design, curve)))
         weight = np.maximum(share * (1.0 - share), _LEAST_WEIGHT)
-        curve += np.linalg.solve(
-            design.T @ (design * weight[:, None]) + prior, design.T @ (found - share) - prior @ curve
-        )
+        slopes = np.sum(design * (found - share)[:, None], axis=0) - product(prior, curve)
+        curve += product(inverse(sum_of_products(design, design * weight[:, None]) + prior), slopes)
     slope = -float(curve[1])
     return middle + (float(curve[0]) / slope if slope else math.inf), slope

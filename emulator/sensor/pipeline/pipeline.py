@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import itertools
-import math
 import subprocess
 import time
 from dataclasses import dataclass, field, replace
@@ -50,9 +49,10 @@ from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.camera.calibration import attitude_covariance
+from starid.camera.position_errors import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
 from starid.catalog.aberration import aberrated
+from starid.elementary import log10
 from starid.errors import StaridError
 from starid.identification.geometric.identifier import Effort
 from starid.identification.geometric.index_choice import pixels_per_radian
@@ -64,6 +64,7 @@ from starid.identification.solution import Reason, Solution
 from starid.identification.star_identifier import StarIdentifier
 from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.imaging.star_windows import detect_near
+from starid.matrices import length, lengths
 
 STARS_SENT: Final = 16
 """Number of identified stars returned to the device; the brightest ones."""
@@ -262,9 +263,11 @@ class Pipeline:
         """Return the star identifier for the parameters of a request."""
         return self._identifiers.build(self._identifier_setup(request))
 
-    def solution(self, detections: Detections, request: FrameRequest) -> Solution:
-        """Identify detections with the parameters of a request."""
-        return self._solve(self.identifier(request), detections, request)
+    def solution(
+        self, detections: Detections, request: FrameRequest, identifier: StarIdentifier | None = None
+    ) -> Solution:
+        """Identify detections with the parameters of a request, by default with the identifier of the device."""
+        return self._solve(identifier or self.identifier(request), detections, request)
 
     def _detect(self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel) -> Detections:
         return detect(*self._detection(exposure, request, sensor))
@@ -345,7 +348,7 @@ class Pipeline:
         if not solution.valid or (solution.features is not None and not solution.features.refined):
             return solution
         offsets = _offsets(identifier, solution, xy, request)
-        within = np.hypot(*offsets.T) <= settings.validation_margin
+        within = lengths(offsets) <= settings.validation_margin
         if np.count_nonzero(within) < settings.min_stars_matched:
             reason = (
                 Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
@@ -376,7 +379,7 @@ class Pipeline:
             return detections, failed
         settings, camera = request.settings, calibrated_camera(self.camera, request.settings)
         stars = self._tracked_stars(
-            settings.limiting_magnitude + 2.5 * math.log10(settings.detection_threshold / _TRACKED_SIGMA)
+            settings.limiting_magnitude + 2.5 * log10(settings.detection_threshold / _TRACKED_SIGMA)
         )
         places = self._predicted_places(predicted, request, stars)
         if len(places) < least:
@@ -391,7 +394,7 @@ class Pipeline:
         seen, rivals = detect_near(image, places, _window_px(settings), faint)
         solution = solve_with_prediction(
             camera, stars, seen, predicted, covariance,
-            2.5 * math.log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY,
+            2.5 * log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY,
             self._setup.tracking_error_rad, rivals=rivals, observer_velocity=request.observer_velocity, known=self._calibration,
         )  # fmt: skip
         if not solution.valid or solution.star_count < least:
@@ -416,7 +419,7 @@ class Pipeline:
     def _leaves_trails(self, request: FrameRequest) -> bool:
         """Whether stars leave trails at the predicted rate: only the whole image shows how they run."""
         rate = request.predicted_rate_rad_s or (0.0, 0.0, 0.0)
-        trail_px = float(np.linalg.norm(rate)) * request.exposure_s * max(self.camera.focal_px)
+        trail_px = length(np.array(rate)) * request.exposure_s * max(self.camera.focal_px)
         return trail_px > _LONGEST_STILL_PX
 
     def _window_centre(self, request: FrameRequest) -> Attitude | None:
@@ -446,7 +449,7 @@ class Pipeline:
         options: dict[str, Any] = {**setup.identifier}
         options.setdefault("limiting_magnitude", settings.limiting_magnitude)
         if setup.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
-            options.setdefault("zero_point", 2.5 * math.log10(self._sensor.zero_magnitude_e_s))
+            options.setdefault("zero_point", 2.5 * log10(self._sensor.zero_magnitude_e_s))
             options.setdefault("colour_term", self._sensor.colour_term)
             if "detected_limit" not in options:
                 found = self._measured_photometry
@@ -491,7 +494,7 @@ class Pipeline:
                     hip=int(hip),
                     x=float(detections.xy_px[row, 0]),
                     y=float(detections.xy_px[row, 1]),
-                    magnitude=-2.5 * math.log10(max(float(detections.flux[row]), 1.0) / zero_e),
+                    magnitude=-2.5 * log10(max(float(detections.flux[row]), 1.0) / zero_e),
                     snr=float(detections.flux[row] / detections.flux_sigma[row]),
                     vector=as_triple(direction),
                     icrs=as_triple(icrs),

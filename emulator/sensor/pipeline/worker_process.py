@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from typing import Final, TypeAlias
 
 EXIT_GRACE_S: Final = 2.0
@@ -67,8 +68,9 @@ _ahead: Final[list[WorkerProcess]] = []
 
 
 def start_ahead() -> None:
-    """Start a worker for the run that this process is going to set up."""
-    _ahead.append(WorkerProcess())
+    """Start a worker for the run that this process is going to set up; if that fails, the run tries it again and reports it."""
+    with suppress(OSError):
+        _ahead.append(WorkerProcess())
 
 
 def take_worker() -> WorkerProcess:

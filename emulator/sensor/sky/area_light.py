@@ -15,6 +15,7 @@ from typing import Final, TypeAlias
 import numpy as np
 
 from starid.arrays import Array, Array32
+from starid.elementary import square
 
 _BLOCK_PIXELS: Final = 1 << 15
 """Pixels that are computed together: some planes of them fit the processor's cache."""
@@ -57,13 +58,13 @@ class Glare:
     @property
     def peak_e_s(self) -> float:
         """Upper limit of the glare in the image, electrons/s."""
-        chord2 = self.nearest**2 + self.soft**2
+        chord2 = square(self.nearest) + square(self.soft)
         return self.strength / (chord2 * math.sqrt(chord2) if self.cube else chord2)
 
     def add_to(self, light: Image, directions: Image) -> None:
         """Add it to the light (h, w) of pixels in directions (3, h, w), in place."""
         chord2 = scalar_products(directions, -2.0 * self.direction)
-        chord2 += np.float32(2.0 + self.soft**2)
+        chord2 += np.float32(2.0 + square(self.soft))
         if self.cube:
             chord2 *= np.sqrt(chord2)
         light += np.float32(self.strength) / chord2
@@ -145,7 +146,7 @@ class AreaLight:
     def draw(self, mean: Image, backdrop: Backdrop) -> None:
         """Fill the mean electrons (h, w) with the backdrop, and all light and shadow."""
         np.copyto(mean, backdrop.still)
-        peak_e = backdrop.exposure_s * sum(glare.peak_e_s for glare in self.glare)
+        peak_e = backdrop.exposure_s * math.fsum(glare.peak_e_s for glare in self.glare)
         if self.directions is not None and peak_e > backdrop.min_glare_e:
             for rows in row_blocks(0, *mean.shape):
                 light = np.zeros_like(mean[rows])

@@ -12,18 +12,22 @@ import numpy as np
 from starhil.emulator.sensor.sky.objects import CatalogError
 from starid.arrays import Array, Indices32
 from starid.attitude import ARCSEC_PER_RAD
+from starid.elementary import cos, sin
+from starid.matrices import lengths
 
 
 def displaced(vectors: Array, east_arcsec: Array, north_arcsec: Array) -> Array:
     """Return directions (n, 3) turned by angles (n,) to the east and north of them, along a great circle."""
-    across = np.hypot(vectors[:, 0], vectors[:, 1])
+    across = lengths(vectors[:, :2])
     safe = np.maximum(across, 1e-12)
     east = np.column_stack([-vectors[:, 1], vectors[:, 0], np.zeros(len(vectors))]) / safe[:, None]
     east[across <= 1e-12] = (0.0, 1.0, 0.0)
     north = np.cross(vectors, east)
     offset = (east_arcsec[:, None] * east + north_arcsec[:, None] * north) / ARCSEC_PER_RAD
-    angle = np.linalg.norm(offset, axis=1, keepdims=True)
-    return np.asarray(np.cos(angle) * vectors + np.sinc(angle / np.pi) * offset)
+    angle = lengths(offset)
+    ahead = np.array([cos(each) for each in angle.tolist()])
+    share = np.array([sin(each) / each if each > 0.0 else 1.0 for each in angle.tolist()])
+    return np.asarray(ahead[:, None] * vectors + share[:, None] * offset)
 
 
 def as_in_the_sky(

@@ -21,6 +21,8 @@ from starhil.emulator.sensor.sky.objects import CelestialBody, EarthLimb, Moon, 
 from starid.arrays import Array
 from starid.catalog.aberration import SPEED_OF_LIGHT_M_S, aberrated
 from starid.catalog.earth import ASTRONOMICAL_UNIT_M, DAY_S, in_metres, terrestrial_time
+from starid.elementary import acos, asin, atan, atan2, cos, exp, hypot, log10, sin, square
+from starid.matrices import dot, length, lengths
 
 Vector = Array
 
@@ -69,9 +71,9 @@ class Observer:
         """Barycentric places (3, 3) of Earth, Sun and Moon, m, and then their velocities (3, 3), m/s, ICRS."""
         slot, since_s = divmod(self.unix_s, SLOT_S)
         share = since_s / SLOT_S
-        a, b, c, d = _cubics_of(int(slot)).reshape(4, 3, 3)
+        a, b, c, d, u, v, w = _polynomials_of(int(slot)).reshape(7, 3, 3)
         place = a + share * (b + share * (c + share * d))
-        velocity = (b + share * (2.0 * c + share * 3.0 * d)) / SLOT_S
+        velocity = u + share * (v + share * w)
         return np.stack([place, velocity])
 
     @cached_property
@@ -84,7 +86,7 @@ class Observer:
     def moon(self) -> Vector:
         """Barycentric position (3,) of the Moon when the light left it that arrives now, m, ICRS."""
         moon, velocity = self._motion[:, 2]
-        seen: Vector = moon - math.dist(moon, self.position_m) / SPEED_OF_LIGHT_M_S * velocity
+        seen: Vector = moon - _length(moon - self.position_m) / SPEED_OF_LIGHT_M_S * velocity
         return seen
 
     @cached_property
@@ -136,16 +138,16 @@ def moon_seen_by(observer: Observer, style: Moon) -> Moon:
     distance, sun_distance = _length(to_observer), _length(to_sun)
     phase = _angle(to_observer / distance, to_sun / sun_distance)
     degrees = math.degrees(phase)
-    light = 5.0 * math.log10(distance / MOON_DISTANCE_M * sun_distance / ASTRONOMICAL_UNIT_M)
+    light = 5.0 * log10(distance / MOON_DISTANCE_M * sun_distance / ASTRONOMICAL_UNIT_M)
     sun, moon = observer.directions[:2]
     ra_deg, dec_deg = observer.places_deg[1]
     return dataclasses.replace(
         style,
         ra_deg=ra_deg,
         dec_deg=dec_deg,
-        diameter_deg=2.0 * math.degrees(math.asin(min(MOON_RADIUS_M / distance, 1.0))),
-        magnitude=-12.73 + 0.026 * degrees + 4e-9 * degrees**4 + light,
-        illuminated=0.5 * (1.0 + math.cos(phase)),
+        diameter_deg=2.0 * math.degrees(asin(min(MOON_RADIUS_M / distance, 1.0))),
+        magnitude=-12.73 + 0.026 * degrees + 4e-9 * square(square(degrees)) + light,
+        illuminated=0.5 * (1.0 + cos(phase)),
         bright_limb_deg=_position_angle(moon, sun),
     )
 
@@ -155,20 +157,20 @@ def earth_seen_by(observer: Observer, style: EarthLimb) -> EarthLimb | None:
     if observer.offset_m is None:
         return None
     distance = _length(observer.offset_m)
-    if distance * math.sin(SMALLEST_EARTH_RAD) > EARTH_RADIUS_M or distance == 0.0:
+    if distance * sin(SMALLEST_EARTH_RAD) > EARTH_RADIUS_M or distance == 0.0:
         return None
     nadir = -observer.offset_m / distance
     if observer.relative_velocity_m_s is not None:
         nadir = aberrated(nadir, observer.relative_velocity_m_s)
-    to_limb = math.sqrt(max(distance**2 - EARTH_RADIUS_M**2, EARTH_RADIUS_M * ATMOSPHERE_M))
+    to_limb = math.sqrt(max(square(distance) - square(EARTH_RADIUS_M), EARTH_RADIUS_M * ATMOSPHERE_M))
     ra_deg, dec_deg = _place_deg(nadir)
     sun_ra_deg, sun_dec_deg = observer.places_deg[0]
     return dataclasses.replace(
         style,
         ra_deg=ra_deg,
         dec_deg=dec_deg,
-        radius_deg=math.degrees(math.asin(min(EARTH_RADIUS_M / distance, 1.0))),
-        atmosphere_deg=math.degrees(math.atan(ATMOSPHERE_M / to_limb)),
+        radius_deg=math.degrees(asin(min(EARTH_RADIUS_M / distance, 1.0))),
+        atmosphere_deg=math.degrees(atan(ATMOSPHERE_M / to_limb)),
         sun_ra_deg=sun_ra_deg,
         sun_dec_deg=sun_dec_deg,
     )
@@ -186,16 +188,26 @@ def planets_seen_by(observer: Observer) -> tuple[PointSource, ...]:
 
 
 @lru_cache(maxsize=2)
-def _cubics_of(slot: int) -> Vector:
-    """Coefficients (4, 9), m, of the barycentric places of Earth, Sun and Moon by the share of a slot that is over."""
+def _polynomials_of(slot: int) -> Vector:
+    """Coefficients of the barycentric places and velocities of Earth, Sun and Moon by the share of a slot that is over.
+
+    They are (4, 9), m, and (3, 9), m/s. The velocities are not the slopes of the places, which are on a grid (`in_metres`).
+    """
     first, rest = terrestrial_time(slot * SLOT_S)
-    (start, slope), (end, last_slope) = (_series(first, rest + k * SLOT_S / DAY_S) for k in (0, 1))
-    rise = end - start
-    return np.stack([start, slope, 3.0 * rise - 2.0 * slope - last_slope, slope + last_slope - 2.0 * rise])
+    (start, u), (_, middle), (end, last) = (
+        _series(first, rest + k * SLOT_S / DAY_S) for k in (0.0, 0.5, 1.0)
+    )
+    rise, slope, last_slope = end - start, SLOT_S * u, SLOT_S * last
+    return np.stack(
+        [
+            *(start, slope, 3.0 * rise - 2.0 * slope - last_slope, slope + last_slope - 2.0 * rise),
+            *(u, 4.0 * middle - 3.0 * u - last, 2.0 * (u + last) - 4.0 * middle),
+        ]
+    )
 
 
 def _series(first: float, rest: float) -> tuple[Vector, Vector]:
-    """Barycentric places (9,) of Earth, Sun and Moon at a terrestrial time, m, and their motion in a slot's length."""
+    """Barycentric places (9,) of Earth, Sun and Moon at a terrestrial time, m, and their velocities, m/s."""
     from erfa import moon98, ufunc
 
     heliocentric, barycentric = (in_metres(pv) for pv in ufunc.epv00(first, rest)[:2])
@@ -204,7 +216,7 @@ def _series(first: float, rest: float) -> tuple[Vector, Vector]:
         np.concatenate([earth, earth - about_sun, earth + about_earth])
         for earth, about_sun, about_earth in zip(barycentric, heliocentric, moon, strict=True)
     )
-    return place, SLOT_S * velocity
+    return place, velocity
 
 
 @lru_cache(maxsize=2)
@@ -223,7 +235,7 @@ def _planets_of(slot: int) -> tuple[Vector, Vector, tuple[float, ...]]:
     for _ in range(_LIGHT_TIME_ROUNDS):
         heliocentric, velocities = in_metres(erfa.plan94(first, rest - delay_s / DAY_S, numbers))
         places = observer.sun + heliocentric
-        delay_s = np.linalg.norm(places - observer.position_m, axis=1) / SPEED_OF_LIGHT_M_S
+        delay_s = lengths(places - observer.position_m) / SPEED_OF_LIGHT_M_S
     magnitudes = tuple(
         _planet_magnitude(observer, place, name, law)
         for (name, _, law), place in zip(_PLANETS, places, strict=True)
@@ -238,22 +250,25 @@ def _planet_magnitude(observer: Observer, place_m: Vector, name: str, law: tuple
     phase = math.degrees(_angle(to_observer / distance, to_sun / sun_distance))
     rings = 0.0
     if name == "Saturn":
-        tilt = abs(float(to_observer @ np.array(_SATURN_POLE))) / distance
-        rings = -tilt * (1.825 + 0.378 * math.exp(-2.25 * phase))
-    light = 5.0 * math.log10(distance * sun_distance / ASTRONOMICAL_UNIT_M**2)
-    return light + rings + sum(term * phase**power for power, term in enumerate(law))
+        tilt = abs(dot(to_observer, np.array(_SATURN_POLE))) / distance
+        rings = -tilt * (1.825 + 0.378 * exp(-2.25 * phase))
+    light = 5.0 * log10(distance * sun_distance / square(ASTRONOMICAL_UNIT_M))
+    by_phase = 0.0
+    for term in reversed(law):
+        by_phase = by_phase * phase + term
+    return light + rings + by_phase
 
 
 def _visible_share_of_sun(observer: Observer, earth: EarthLimb | None) -> float:
     """Return the share of the Sun's disc that the Earth leaves visible, 0…1 (the limb taken as straight)."""
     if earth is None:
         return 1.0
-    radius = math.asin(SUN_RADIUS_M / _length(observer.sun - observer.position_m))
+    radius = asin(SUN_RADIUS_M / _length(observer.sun - observer.position_m))
     above = _angle(observer.directions[0], earth.direction)
     height = (above - earth.radius_rad) / radius
     if abs(height) >= 1.0:
         return 1.0 if height > 0.0 else 0.0
-    return (math.acos(-height) + height * math.sqrt(1.0 - height * height)) / math.pi
+    return (acos(-height) + height * math.sqrt(1.0 - height * height)) / math.pi
 
 
 def hidden_by(earth: EarthLimb | None, body: CelestialBody) -> bool:
@@ -264,22 +279,21 @@ def hidden_by(earth: EarthLimb | None, body: CelestialBody) -> bool:
 def _place_deg(direction: Vector) -> tuple[float, float]:
     """Right ascension and declination of a direction, degrees."""
     x, y, z = direction.tolist()
-    return math.degrees(math.atan2(y, x)) % 360.0, math.degrees(math.atan2(z, math.hypot(x, y)))
+    return math.degrees(atan2(y, x)) % 360.0, math.degrees(atan2(z, hypot(x, y)))
 
 
 def _length(vector: Vector) -> float:
     """Length of a vector (3,)."""
-    return math.hypot(*vector.tolist())
+    return length(vector)
 
 
 def _angle(one: Vector, other: Vector) -> float:
     """Angle between two unit vectors, radians."""
-    a, b = one.tolist(), other.tolist()
-    return 2.0 * math.atan2(math.dist(a, b), math.hypot(*(x + y for x, y in zip(a, b, strict=True))))
+    return 2.0 * atan2(length(one - other), length(one + other))
 
 
 def _position_angle(origin: Vector, target: Vector) -> float:
     """Position angle of one direction seen from another, from north through east, degrees."""
     (x, y, z), (u, v, w) = origin.tolist(), target.tolist()
     east, north = x * v - y * u, w * (x * x + y * y) - z * (x * u + y * v)
-    return math.degrees(math.atan2(east, north)) % 360.0
+    return math.degrees(atan2(east, north)) % 360.0

@@ -27,9 +27,11 @@ from starhil.emulator.sensor.sky.objects import (
     SkyObjects,
     SunGlare,
 )
-from starid.arrays import Array, Array32
+from starid.arrays import Array, Array32, elementwise
 from starid.attitude import Attitude
 from starid.camera import Camera
+from starid.elementary import acos, asin, atan2, cos, exp, hypot, log, log10, power, sin, square
+from starid.matrices import dot, length, product
 
 _BORDER_SAMPLES: Final = 33
 _GLARE_FROM_DEG: Final = 0.3
@@ -70,12 +72,12 @@ def _blurred(image: Image, taps: Array32) -> Image:
 
 def disc_in_field(centre: Array, radius_rad: float, camera: Camera) -> bool:
     """Return whether any part of a disc around a direction (3,) of the sensor frame is in the field."""
-    if math.acos(max(min(float(centre[2]), 1.0), -1.0)) > camera.field_radius_rad + radius_rad:
+    if acos(max(min(float(centre[2]), 1.0), -1.0)) > camera.field_radius_rad + radius_rad:
         return False
     if camera.project(centre[None, :])[1][0]:
         return True
-    nearest = float(np.max(_border_of(camera) @ centre, initial=-1.0))
-    return nearest >= math.cos(min(radius_rad, math.pi))
+    nearest = float(np.max(product(_border_of(camera), centre), initial=-1.0))
+    return nearest >= cos(min(radius_rad, math.pi))
 
 
 @lru_cache(maxsize=4)
@@ -108,13 +110,13 @@ def _is_lit(earth: EarthLimb, towards: Array, off_nadir_deg: float) -> bool:
     if sun is None:
         return True
     nadir = earth.direction
-    sideways = towards - float(towards @ nadir) * nadir
-    sideways /= max(float(np.linalg.norm(sideways)), 1e-12)
-    angle, distance = math.radians(off_nadir_deg), 1.0 / math.sin(earth.radius_rad)
-    line = math.cos(angle) * nadir + math.sin(angle) * sideways
-    under = max(1.0 - (distance * math.sin(angle)) ** 2, 0.0)
-    normal = (distance * math.cos(angle) - math.sqrt(under)) * line - distance * nadir
-    return float(normal @ sun) > 0.0
+    sideways = towards - dot(towards, nadir) * nadir
+    sideways /= max(length(sideways), 1e-12)
+    angle, distance = math.radians(off_nadir_deg), 1.0 / sin(earth.radius_rad)
+    line = cos(angle) * nadir + sin(angle) * sideways
+    under = max(1.0 - square(distance * sin(angle)), 0.0)
+    normal = (distance * cos(angle) - math.sqrt(under)) * line - distance * nadir
+    return dot(normal, sun) > 0.0
 
 
 def _left_by_baffle(sun: SunGlare, attitude: Attitude) -> float:
@@ -122,18 +124,18 @@ def _left_by_baffle(sun: SunGlare, attitude: Attitude) -> float:
     if sun.decade_deg == 0.0:
         return sun.stray_share
     outside_deg = max(_off_axis_deg(attitude, sun) - sun.exclusion_deg, 0.0)
-    return max(sun.stray_share, math.pow(10.0, -outside_deg / sun.decade_deg))
+    return max(sun.stray_share, power(10.0, -outside_deg / sun.decade_deg))
 
 
 def _chord(angle_rad: float) -> float:
     """Chord of an angle on the unit circle."""
-    return 2.0 * math.sin(0.5 * angle_rad)
+    return 2.0 * sin(0.5 * angle_rad)
 
 
 def _off_axis_deg(attitude: Attitude, body: CelestialBody) -> float:
     """Angle of a body's centre from the boresight, degrees."""
-    chord = math.dist(body.direction.tolist(), attitude.boresight.tolist())
-    return math.degrees(2.0 * math.asin(min(0.5 * chord, 1.0)))
+    chord = length(body.direction - attitude.boresight)
+    return math.degrees(2.0 * asin(min(0.5 * chord, 1.0)))
 
 
 class AreaPainter:
@@ -164,7 +166,7 @@ class AreaPainter:
     def _spot_taps(self) -> Array32:
         """Weights (2 m + 1,) of a Gaussian as wide as a spot."""
         reach = math.ceil(_BLUR_SIGMAS * self._psf_sigma_px)
-        weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / self._psf_sigma_px) ** 2)
+        weights = elementwise(exp, -0.5 * square(np.arange(-reach, reach + 1) / self._psf_sigma_px))
         return np.asarray(weights / weights.sum(), dtype=np.float32)
 
     @property
@@ -216,15 +218,15 @@ class AreaPainter:
         The fraction `glare_share` of the light in the pupil goes into the angles between `_GLARE_FROM_DEG` and
         `_GLARE_TO_DEG`.
         """
-        share = body.glare_share / (2.0 * math.pi * math.log(_GLARE_TO_DEG / _GLARE_FROM_DEG))
-        return self._electrons_s(body.magnitude) * share * self._camera.pixel_scale_rad**2
+        share = body.glare_share / (2.0 * math.pi * log(_GLARE_TO_DEG / _GLARE_FROM_DEG))
+        return self._electrons_s(body.magnitude) * share * square(self._camera.pixel_scale_rad)
 
     def _electrons_s(self, magnitude: float) -> float:
-        return self._zero_magnitude_e_s * math.pow(10.0, -0.4 * magnitude)
+        return self._zero_magnitude_e_s * power(10.0, -0.4 * magnitude)
 
     def _earthlight(self, earth: EarthLimb) -> float:
         """Electrons/s per pixel of an Earth with the Sun in the zenith, by Lambert's law."""
-        return self._electrons_s(SUN_V) * earth.albedo / math.pi * self._camera.pixel_scale_rad**2
+        return self._electrons_s(SUN_V) * earth.albedo / math.pi * square(self._camera.pixel_scale_rad)
 
     def _disc_patch(self, moon: Moon, attitude: Attitude) -> list[Patch]:
         """Return the disc of Moon or Sun with the terminator; nothing if it is outside the image."""
@@ -233,9 +235,9 @@ class AreaPainter:
         if box is None:
             return []
         x, y, z = moon.direction.tolist()
-        across, along = math.hypot(x, y), math.radians(moon.bright_limb_deg)
+        across, along = hypot(x, y), math.radians(moon.bright_limb_deg)
         east, north = (-y / across, x / across, 0.0), (-x * z / across, -y * z / across, across)
-        turn = (math.cos(along) / moon.radius_rad, math.sin(along) / moon.radius_rad)
+        turn = (cos(along) / moon.radius_rad, sin(along) / moon.radius_rad)
         axes = attitude.to_sensor(np.array([north, east]))
         top, bottom, left, right = box
         directions = self._directions[:, top:bottom, left:right].astype(np.float64)
@@ -245,7 +247,7 @@ class AreaPainter:
         u, v = turn[0] * up + turn[1] * sideways, turn[0] * sideways - turn[1] * up
         inside = np.clip(0.5 + (1.0 - np.sqrt(u * u + v * v)) * scale, 0.0, 1.0) * (ahead > 0.0)
         terminator = (1.0 - 2.0 * moon.illuminated) * np.sqrt(np.maximum(1.0 - v * v, 0.0))
-        area = max(math.pi * scale**2 * moon.illuminated, 1.0)
+        area = max(math.pi * square(scale) * moon.illuminated, 1.0)
         brightness = self._electrons_s(moon.magnitude) / area
         disc = inside * np.clip(0.5 + (u - terminator) * scale, 0.0, 1.0) * brightness
         light = _blurred(disc.astype(np.float32), self._spot_taps)
@@ -257,10 +259,10 @@ class AreaPainter:
         mirrored = attitude.to_icrs(np.array([-x, -y, z]))
         ghost = dataclasses.replace(
             moon,
-            ra_deg=math.degrees(math.atan2(mirrored[1], mirrored[0])),
-            dec_deg=math.degrees(math.asin(max(min(float(mirrored[2]), 1.0), -1.0))),
+            ra_deg=math.degrees(atan2(float(mirrored[1]), float(mirrored[0]))),
+            dec_deg=math.degrees(asin(max(min(float(mirrored[2]), 1.0), -1.0))),
             bright_limb_deg=(moon.bright_limb_deg + 180.0) % 360.0,
-            magnitude=moon.magnitude - 2.5 * math.log10(share),
+            magnitude=moon.magnitude - 2.5 * log10(share),
         )
         return [
             dataclasses.replace(patch, passed=np.ones_like(patch.passed))
@@ -270,10 +272,10 @@ class AreaPainter:
     def _box_around(self, direction: Array, radius_rad: float) -> Box | None:
         """Return the part of the image that holds a disc in the sensor frame; None if it is outside."""
         reach_rad = radius_rad + 1.25 * _GRID_STEP * self._camera.pixel_scale_rad
-        if math.acos(max(min(float(direction[2]), 1.0), -1.0)) > self._camera.field_radius_rad + reach_rad:
+        if acos(max(min(float(direction[2]), 1.0), -1.0)) > self._camera.field_radius_rad + reach_rad:
             return None
         grid = self._directions[:, ::_GRID_STEP, ::_GRID_STEP]
-        near = scalar_products(grid, direction) >= math.cos(min(reach_rad, math.pi))
+        near = scalar_products(grid, direction) >= cos(min(reach_rad, math.pi))
         if not near.any():
             return None
         sides = []
@@ -295,9 +297,9 @@ class AreaPainter:
         light = np.zeros((bottom - top, right - left), dtype=np.float32)
         passed = np.ones_like(light)
         zero, one = np.float32(0.0), np.float32(1.0)
-        distance = np.float32(1.0 / math.sin(earth.radius_rad))
+        distance = np.float32(1.0 / sin(earth.radius_rad))
         sun = None if earth.sun_direction is None else attitude.to_sensor(earth.sun_direction)
-        behind = one if sun is None else np.float32(-float(distance) * sum(nadir * sun))
+        behind = one if sun is None else np.float32(-float(distance) * dot(nadir, sun))
         full = np.float32(self._earthlight(earth))
         end, edge, step, limb_of = self._limb(earth)
         for rows in row_blocks(0, bottom - top, right - left):
@@ -337,11 +339,11 @@ class AreaPainter:
         glow to the edge of the disc, which come first, with the step.
         """
         height_rad = self._atmosphere_rad(earth)
-        end = math.cos(min(earth.radius_rad + _GLOW_HEIGHTS * height_rad, math.pi))
-        step = (math.cos(earth.radius_rad) - end) / _LIMB_STEPS
-        angles = [math.acos(end + k * step) for k in range(_LIMB_STEPS)]
+        end = cos(min(earth.radius_rad + _GLOW_HEIGHTS * height_rad, math.pi))
+        step = (cos(earth.radius_rad) - end) / _LIMB_STEPS
+        angles = [acos(end + k * step) for k in range(_LIMB_STEPS)]
         heights = [*((angle - earth.radius_rad) / height_rad for angle in angles), 0.0, 0.0]
-        table = [[min(height, 1.0) for height in heights], [math.exp(-height) for height in heights]]
+        table = [[min(height, 1.0) for height in heights], [exp(-height) for height in heights]]
         edge = np.float32(end + _LIMB_STEPS * step)
         return np.float32(end), edge, np.float32(step), np.array(table, dtype=np.float32)
 
@@ -367,7 +369,7 @@ def _transmission_of(obstruction: Obstruction, width: int, height: int) -> Image
     else:
         angle = math.radians(obstruction.angle_deg)
         x, y = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
-        along = (math.cos(angle) * x)[None, :] + (math.sin(angle) * y)[:, None]
+        along = (cos(angle) * x)[None, :] + (sin(angle) * y)[:, None]
         edge = np.quantile(along, 1.0 - obstruction.share)
         partial = 0.0 < obstruction.share < 1.0
         cover = (along <= edge if partial else np.full_like(along, obstruction.share == 0.0)).astype(

@@ -16,6 +16,7 @@ import numpy as np
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.simulation.limited import limited, listed
 from starid.arrays import Array
+from starid.elementary import cos, sin
 
 _MAX_OBJECTS: Final = 100_000
 
@@ -33,7 +34,7 @@ MAX_ROWS: Final = 200
 def icrs_vector(ra_deg: float, dec_deg: float) -> Array:
     """Unit vector (3,) of a direction."""
     ra, dec = math.radians(ra_deg), math.radians(dec_deg)
-    return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+    return np.array([cos(dec) * cos(ra), cos(dec) * sin(ra), sin(dec)])
 
 
 @dataclass(frozen=True)

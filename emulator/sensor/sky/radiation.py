@@ -8,6 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.elementary import asin, atan2, exp, square
+
 EARTH_RADIUS_KM: Final = 6371.0
 REFERENCE_ALTITUDE_KM: Final = 500.0
 
@@ -32,7 +34,7 @@ def default_rates(width: int, height: int, pixel_um: float) -> tuple[float, floa
 
     Of an isotropic flux, a plane is crossed by half of what a sphere of that cross-section is.
     """
-    area_cm2 = width * height * (pixel_um * 1e-4) ** 2
+    area_cm2 = width * height * square(pixel_um * 1e-4)
     return 0.5 * QUIET_CM2_S * area_cm2, 0.5 * ANOMALY_CM2_S * area_cm2
 
 
@@ -46,8 +48,8 @@ def sub_satellite_point(position_m: npt.ArrayLike, unix_s: float) -> tuple[float
     distance = math.sqrt(x * x + y * y + z * z)
     days = (unix_s - _J2000_UNIX_S) / _DAY_S
     rotation = 2.0 * math.pi * (0.7790572732640 + 1.00273781191135448 * days)
-    longitude = math.degrees(math.atan2(y, x) - rotation)
-    latitude = math.degrees(math.asin(z / distance))
+    longitude = math.degrees(atan2(y, x) - rotation)
+    latitude = math.degrees(asin(z / distance))
     return latitude, (longitude + 180.0) % 360.0 - 180.0, distance - EARTH_RADIUS_KM
 
 
@@ -61,7 +63,7 @@ def anomaly_share(latitude_deg: float, longitude_deg: float, altitude_km: float)
     north = (latitude_deg - _CENTRE_DEG[0]) / _WIDTH_LATITUDE_DEG
     east /= _WIDTH_EAST_DEG if east > 0.0 else _WIDTH_WEST_DEG
     above = min(max(altitude_km, _ALTITUDES_KM[0]), _ALTITUDES_KM[1]) - REFERENCE_ALTITUDE_KM
-    return math.exp(-0.5 * (north * north + east * east) + above / _SCALE_HEIGHT_KM)
+    return exp(-0.5 * (north * north + east * east) + above / _SCALE_HEIGHT_KM)
 
 
 def particle_rate(

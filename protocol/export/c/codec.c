@@ -88,6 +88,25 @@ static bool to_raw(double value, double low, double high, uint64_t *raw)
     return size >= low && size <= high;
 }
 
+/* The same in single precision, for numbers below 2^24. */
+static bool to_raw_single(float value, float low, float high, uint64_t *raw)
+{
+    uint32_t whole;
+    float size, rest;
+    if (!(value >= low - 0.5f && value <= high + 0.5f)) {
+        return false;
+    }
+    size = value < 0.0f ? -value : value;
+    whole = (uint32_t)size;
+    rest = size - (float)whole;
+    if (rest > 0.5f || (rest == 0.5f && (whole & 1u) != 0u)) {
+        ++whole;
+    }
+    size = value < 0.0f ? -(float)whole : (float)whole;
+    *raw = value < 0.0f ? (uint64_t)0 - whole : whole;
+    return size >= low && size <= high;
+}
+
 static void get_text(const uint8_t *data, size_t size, char *text)
 {
     memcpy(text, data, size);

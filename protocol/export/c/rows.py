@@ -14,6 +14,9 @@ from starhil.protocol.icd.codec import Field, Row, Slot
 from starhil.protocol.icd.quoting import Scope, c_comment, c_member, c_string, identifier, one_line
 from starhil.protocol.icd.values import INTEGER_RANGES, EnumDefinition, Value, representable
 
+FLOAT_STEPS: Final = 2.0**18
+"""Most steps between zero and the ends of a scaled integer whose member is a `float`: each step is 64 times its rounding."""
+
 MAP: Final = "map"
 """Name of every enumeration that a field has by its `map`."""
 
@@ -97,7 +100,7 @@ class RowCode:
             case str():
                 return c_string(value)
             case _ if field.scaled or field.kind == "float":
-                return repr(float(value))
+                return _literal(field, float(value))
             case _:
                 return _integer(int(value), signed=_signed(field))
 
@@ -107,6 +110,18 @@ def enum_name(row: Row, field: Field) -> str:
     if field.enum is None or field.enum.name == MAP:
         return f"{row.name}_{field.name}"
     return field.enum.name
+
+
+def is_single(field: Field) -> bool:
+    """Whether the member of a number with a fraction is a `float`, which distinguishes all its values."""
+    if field.kind == "float":
+        return field.type == "f32" and not field.scaled
+    offset = abs(field.bias / field.scale)
+    return field.scaled and max(map(abs, field.raw_limits)) + offset < FLOAT_STEPS
+
+
+def _literal(field: Field, value: float) -> str:
+    return f"{value!r}f" if is_single(field) else repr(value)
 
 
 def _signed(field: Field) -> bool:
@@ -123,7 +138,7 @@ def _declarator(field: Field) -> str:
             return f"uint8_t {member}[{field.size}]"
         case "text":
             return f"char {member}[{field.size + 1}]"
-        case "float" if field.type == "f32" and not field.scaled:
+        case _ if is_single(field):
             return f"float {member}"
         case _ if field.scaled or field.kind == "float":
             return f"double {member}"
@@ -171,19 +186,21 @@ def _check(row: Row, field: Field) -> str:
 def _check_float(row: Row, field: Field, value: str) -> str:
     low, high = representable(*field.physical_limits, field.type)
     if row.kind == "telemetry":  # which may carry what is no number
-        tests = [f"{value} < {low!r}"] * (field.minimum is not None)
-        return " || ".join(tests + [f"{value} > {high!r}"] * (field.maximum is not None))
-    lowest = repr(low) if math.isfinite(low) else "-DBL_MAX"
-    return f"!({value} >= {lowest} && {value} <= {repr(high) if math.isfinite(high) else 'DBL_MAX'})"
+        tests = [f"{value} < {_literal(field, low)}"] * (field.minimum is not None)
+        return " || ".join(tests + [f"{value} > {_literal(field, high)}"] * (field.maximum is not None))
+    largest = "FLT_MAX" if is_single(field) else "DBL_MAX"
+    lowest = _literal(field, low) if math.isfinite(low) else f"-{largest}"
+    return f"!({value} >= {lowest} && {value} <= {_literal(field, high) if math.isfinite(high) else largest})"
 
 
 def _to_raw(field: Field, value: str) -> str:
-    low, high = field.raw_limits
-    return f"to_raw({_unscaled(field, value)}, {float(low)!r}, {float(high)!r}, &raw)"
+    low, high = (_literal(field, float(limit)) for limit in field.raw_limits)
+    function = "to_raw_single" if is_single(field) else "to_raw"
+    return f"{function}({_unscaled(field, value)}, {low}, {high}, &raw)"
 
 
 def _unscaled(field: Field, value: str) -> str:
-    return f"({value} - {field.bias!r}) / {field.scale!r}"
+    return f"({value} - {_literal(field, field.bias)}) / {_literal(field, field.scale)}"
 
 
 # --- encoding and decoding ---
@@ -261,5 +278,5 @@ def _scaled(field: Field, raw: str) -> str:
     if not field.scaled:
         return raw
     divisor = field.divisor if field.kind != "float" else None
-    scaled = f"(double){raw} / {float(divisor)!r}" if divisor else f"(double){raw} * {field.scale!r}"
-    return f"{scaled} + {field.bias!r}"
+    factor = f"/ {_literal(field, float(divisor))}" if divisor else f"* {_literal(field, field.scale)}"
+    return f"({'float' if is_single(field) else 'double'}){raw} {factor} + {_literal(field, field.bias)}"

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from starid.arrays import Array, Indices
+from starid.elementary import log, square
 from starid.identification.geometric.observation import SIGMA_U, SIGMA_V, SOURCE, Raw, Table
 from starid.identification.geometric.pattern_index import IndexArrays
 from starid.identification.geometric.refinement import (
@@ -138,7 +139,7 @@ def test_and_refine(
     )
     if matched == 0 or numbers[RMS] > math.sqrt(2.0) * settings.largest_sigma:
         return 0, 0.0
-    if abs(math.log(numbers[SCALE])) > 1.5 * settings.scale_tolerance:
+    if abs(log(numbers[SCALE])) > 1.5 * settings.scale_tolerance:
         return 0, 0.0
     bound = log_false_probability(
         index, detections, rotation, candidate.stars, matched, candidate.normal, numbers, settings, prior
@@ -203,7 +204,7 @@ def make_answer(
         if candidate.stars[i] >= 0:
             pairs[0, filled] = np.int64(observed[i, SOURCE])
             pairs[1, filled] = candidate.stars[i]
-            mean_sigma2 += 0.5 * (observed[i, SIGMA_U] ** 2 + observed[i, SIGMA_V] ** 2) / m
+            mean_sigma2 += 0.5 * (square(observed[i, SIGMA_U]) + square(observed[i, SIGMA_V])) / m
             filled += 1
     freedom = float(max(2 * m - (4 if settings.scale_tolerance > 0.0 else 3), 1))
     variance = numbers[VARIANCE]

@@ -21,6 +21,7 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.catalog.aberration import checked_beta
+from starid.elementary import exp, log, sin, square, tan
 from starid.errors import StaridError
 from starid.identification.geometric.answer import MIN_MATCHED, Answer
 from starid.identification.geometric.index_choice import (
@@ -99,8 +100,8 @@ class Effort:
         numbers["window"] = self.window_px
         numbers["test_window"] = self.test_window_px / px_per_rad
         numbers["largest_sigma"] = self.window_px / 3.0
-        numbers["log_chance"] = math.log(self.max_false_probability)
-        numbers["log_chance_tracking"] = math.log(self.max_false_probability_tracking)
+        numbers["log_chance"] = log(self.max_false_probability)
+        numbers["log_chance_tracking"] = log(self.max_false_probability_tracking)
         numbers["px_per_rad"] = px_per_rad
         numbers["field_px"] = camera.width * camera.height
         return numbers
@@ -219,7 +220,7 @@ class Identifier(SingleCameraIdentifier):
             scaled_camera(self._camera, 1.0 + 2.0 * share * step)
             for step in sorted(range(1 - steps, steps), key=abs)
         ]
-        numbers["log_chance"] -= math.log(len(cameras))
+        numbers["log_chance"] -= log(len(cameras))
         solution = Solution.invalid(Reason.NO_MATCH)
         for triangles, part_stars in (
             (_QUICK_TRIANGLES, 0),
@@ -277,8 +278,8 @@ class Identifier(SingleCameraIdentifier):
         """Prior volume of rotations within a window, rad³, and solid angle of the window."""
         # a star at the edge of the field stays within it after a roll of window/(field radius)
         radius = math.sqrt(self._camera.width * self._camera.height / math.pi) / self._px_per_rad
-        volume = 2.0 * math.pi * window_rad**2 * min(window_rad / radius, math.pi)
-        return min(volume, WHOLE_SKY[0]), min(math.pi * window_rad**2, WHOLE_SKY[1])
+        volume = 2.0 * math.pi * square(window_rad) * min(window_rad / radius, math.pi)
+        return min(volume, WHOLE_SKY[0]), min(math.pi * square(window_rad), WHOLE_SKY[1])
 
     def warm_up(self) -> None:
         """Compile or load the kernels, so that the first image is not delayed."""
@@ -344,7 +345,7 @@ class Identifier(SingleCameraIdentifier):
             covariance=answer.covariance,
             rms_px=rms,
             sigma_px=sigma,
-            probability_false=math.exp(log_false),
+            probability_false=exp(log_false),
             mode=mode,
         )
 
@@ -353,8 +354,8 @@ def _scale_variation(camera: Camera) -> float:
     """Variation across the field of the scale of triangle sides, per relative change of focal length."""
     angle = min(camera.field_radius_rad, 0.5 * math.pi)
     if camera.model == "pinhole":
-        return 2.0 * math.sin(angle) ** 2
-    return 1.0 - angle / math.tan(angle)
+        return 2.0 * square(sin(angle))
+    return 1.0 - angle / tan(angle)
 
 
 def scaled_camera(camera: Camera, factor: float) -> Camera:

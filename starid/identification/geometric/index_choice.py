@@ -12,6 +12,7 @@ import numpy as np
 
 from starid.camera import Camera
 from starid.catalog import StarCatalog
+from starid.elementary import power, square
 from starid.errors import StaridError
 from starid.identification.geometric import index_file
 from starid.identification.geometric.pattern_index import (
@@ -76,8 +77,11 @@ def pixels_per_radian(camera: Camera) -> float:
     grid = np.stack(np.meshgrid(steps * (camera.width - 1), steps * (camera.height - 1)), axis=-1)
     directions = camera.back_project(grid.reshape(-1, 2))
     directions = directions[np.isfinite(directions[:, 0])]
-    values = np.linalg.svd(camera.jacobian(directions), compute_uv=False)
-    return float(values[:, 1].min())
+    slopes = camera.jacobian(directions)
+    u, v = slopes[:, 0], slopes[:, 1]
+    uu, uv, vv = np.sum(square(u), axis=1), np.sum(u * v, axis=1), np.sum(square(v), axis=1)
+    smaller = 0.5 * (uu + vv - np.sqrt(square(uu - vv) + 4.0 * square(uv)))
+    return math.sqrt(float(smaller.min()))
 
 
 def index_settings(
@@ -109,8 +113,8 @@ def index_settings(
     width = math.sqrt(area)
     window = window_px / least
     spacing = math.sqrt(4.0 * math.pi / max(len(catalog.brighter_than(limiting_magnitude)), 1))
-    cube = MAX_DEEP * area / (_STARS_PER_QUOTA * _TRIANGLES_PER_QUOTA2 * MIDDLE_SIDE**4)
-    quota = min(max(int(cube ** (1.0 / 3.0)), SMALLEST_QUOTA), LARGEST_QUOTA)
+    cube = MAX_DEEP * area / (_STARS_PER_QUOTA * _TRIANGLES_PER_QUOTA2 * square(square(MIDDLE_SIDE)))
+    quota = min(max(int(power(cube, 1.0 / 3.0)), SMALLEST_QUOTA), LARGEST_QUOTA)
     deep = min(_longest_share(MAX_DEEP, quota, area), DEEP_SIDES[1])
     bright = max(min(_longest_share(MAX_BRIGHT, BRIGHT_QUOTA, area), BRIGHT_SIDES[1]), deep)
     return IndexSettings(
@@ -130,7 +134,7 @@ def index_settings(
 def _longest_share(triangles: int, quota: int, area: float) -> float:
     """Longest side, as a share of the width of the field, for about a given number of triangles."""
     per_star = triangles * area / (_STARS_PER_QUOTA * quota)
-    return float((per_star / (_TRIANGLES_PER_QUOTA2 * quota**2)) ** 0.25)
+    return math.sqrt(math.sqrt(per_star / (_TRIANGLES_PER_QUOTA2 * square(quota))))
 
 
 def obtain_stars(catalog: StarCatalog, settings: IndexSettings, cache: bool | str | Path) -> StarCatalog:

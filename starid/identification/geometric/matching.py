@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices, Mask
+from starid.elementary import square
 from starid.identification.geometric.observation import (
     MAGNITUDE,
     SIGMA_U,
@@ -100,8 +101,8 @@ def _best_star(
         if deviation < -gate or dx * dx + dy * dy + dz * dz > limit * limit:
             continue
         r0, r1, _, _, _ = residual(star_table, detections, rotation, i, star)
-        distance2 = (r0 / error_u) ** 2 + (r1 / error_v) ** 2
-        cost = distance2 + (deviation / scatter) ** 2
+        distance2 = square(r0 / error_u) + square(r1 / error_v)
+        cost = distance2 + square(deviation / scatter)
         if distance2 <= WINDOW_SIGMAS * WINDOW_SIGMAS and cost < best_cost:
             best, best_cost = star, cost
     return best, best_cost

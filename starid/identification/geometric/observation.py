@@ -25,6 +25,7 @@ from starid.camera.projection import (
     plane_slopes,
     undistort,
 )
+from starid.elementary import atan2, cos, log10, sin
 from starid.kernels.jit import inner
 from starid.kernels.small_arrays import zero
 
@@ -144,7 +145,7 @@ def observe(raw: Raw) -> Table:
     for row in order:
         if not fill_direction(params, 1.0, xy[row, 0], xy[row, 1], table, n):
             continue
-        table[n, MAGNITUDE] = -2.5 * math.log10(flux[row]) if flux[row] > 0.0 else FAINTEST
+        table[n, MAGNITUDE] = -2.5 * log10(flux[row]) if flux[row] > 0.0 else FAINTEST
         table[n, SIGMA_U], table[n, SIGMA_V] = sigmas[row, 0], sigmas[row, 1]
         table[n, OFFSET_U], table[n, OFFSET_V] = xy[row, 0] - params[CX], xy[row, 1] - params[CY]
         _to_error_axes(sigmas[row, 2], U_X, V_X, 3, table, n)
@@ -213,6 +214,6 @@ def scaled(model: float, x: float, y: float, z: float, scale: float) -> tuple[fl
     lateral = math.sqrt(x * x + y * y)
     if lateral == 0.0:
         return x, y, z
-    angle = scale * math.atan2(lateral, z)
-    factor = math.sin(angle) / lateral
-    return x * factor, y * factor, math.cos(angle)
+    angle = scale * atan2(lateral, z)
+    factor = sin(angle) / lateral
+    return x * factor, y * factor, cos(angle)

@@ -25,10 +25,12 @@ from starid.arrays import Array, Indices, Indices32, Mask
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.catalog.catalog import companions, merge_close_stars
+from starid.elementary import sin, square
 from starid.errors import StaridError
 from starid.identification.geometric.pattern_stars import select_pattern_stars
 from starid.identification.geometric.sky_grid import FACES, build_sky_grid, cell_of
 from starid.kernels.jit import compiled_ieee, inner
+from starid.matrices import lengths
 
 INDEX_VERSION: Final = 5
 """Incremented whenever the same catalogue and settings would yield a different index."""
@@ -154,7 +156,7 @@ def _adjacency(vectors: Array, radius_rad: float) -> tuple[Indices, Indices]:
     """Neighbours of each star within a radius, ascending, in compressed rows: start (m + 1,), neighbours."""
     from scipy.spatial import cKDTree
 
-    pairs = cKDTree(vectors).query_pairs(2.0 * math.sin(0.5 * radius_rad), output_type="ndarray")
+    pairs = cKDTree(vectors).query_pairs(2.0 * sin(0.5 * radius_rad), output_type="ndarray")
     left = np.concatenate([pairs[:, 0], pairs[:, 1]])
     right = np.concatenate([pairs[:, 1], pairs[:, 0]])
     order = np.lexsort((right, left))
@@ -270,7 +272,7 @@ def _count_field_stars(vectors: Array, magnitudes: Array, cap_cosine: float, bin
                 centre[face // 2] = 1.0 if face % 2 == 0 else -1.0
                 centre[(face // 2 + 1) % 3] = (2.0 * i + 1.0) / COUNT_CELLS - 1.0
                 centre[(face // 2 + 2) % 3] = (2.0 * j + 1.0) / COUNT_CELLS - 1.0
-                centre /= math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
+                centre /= math.sqrt(square(centre[0]) + square(centre[1]) + square(centre[2]))
                 cell = cell_of(centre[0], centre[1], centre[2], COUNT_CELLS)
                 for star in range(vectors.shape[0]):
                     v = vectors[star]
@@ -349,7 +351,7 @@ def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
 
 def _chords(angles: tuple[float, float]) -> tuple[float, float]:
     """Chords that subtend two angles."""
-    return 2.0 * math.sin(0.5 * angles[0]), 2.0 * math.sin(0.5 * angles[1])
+    return 2.0 * sin(0.5 * angles[0]), 2.0 * sin(0.5 * angles[1])
 
 
 def field_solid_angle(camera: Camera) -> float:
@@ -361,5 +363,5 @@ def field_solid_angle(camera: Camera) -> float:
     here = camera.back_project(grid)
     right = camera.back_project(grid + np.array([0.01, 0.0])) - here
     down = camera.back_project(grid + np.array([0.0, 0.01])) - here
-    areas = np.linalg.norm(np.cross(right, down), axis=1) / 1e-4
+    areas = lengths(np.cross(right, down)) / 1e-4
     return float(np.nanmean(areas)) * camera.width * camera.height

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices, Mask
+from starid.elementary import acos, sin
 from starid.kernels.jit import compiled_ieee
 
 _FINEST_CELL: Final = 0.01
@@ -22,7 +23,7 @@ def _select(vectors: Array, chord: float, quota: int, finest_cell: float) -> Mas
     """
     edge = max(chord, finest_cell)
     cells = int(2.0 / edge) + 1
-    head = np.full(cells**3, -1, dtype=np.int32)
+    head = np.full(cells * cells * cells, -1, dtype=np.int32)
     behind = np.full(vectors.shape[0], -1, dtype=np.int32)
     taken = np.zeros(vectors.shape[0], dtype=np.bool_)
     reach2 = chord * chord
@@ -59,5 +60,5 @@ def select_pattern_stars(vectors: Array, cap_area_sr: float, quota: int) -> Indi
     quota : int
         Largest number of selected stars in a neighbourhood.
     """
-    radius = math.acos(max(1.0 - cap_area_sr / (2.0 * math.pi), -1.0))
-    return np.flatnonzero(_select(vectors, 2.0 * math.sin(0.5 * radius), quota, _FINEST_CELL))
+    radius = acos(max(1.0 - cap_area_sr / (2.0 * math.pi), -1.0))
+    return np.flatnonzero(_select(vectors, 2.0 * sin(0.5 * radius), quota, _FINEST_CELL))

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices
+from starid.elementary import cos, exp, power, sin, square
 from starid.identification.geometric.matching import BY_NOISE, match_detections, residual
 from starid.identification.geometric.observation import (
     MAGNITUDE,
@@ -78,7 +79,7 @@ def rotate_sensor(rotation: Array, vx: float, vy: float, vz: float) -> None:
     angle = math.sqrt(angle2)
     s, c = 1.0 - angle2 / 6.0, 0.5 - angle2 / 24.0
     if angle > 1e-4:
-        s, c = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle2
+        s, c = sin(angle) / angle, (1.0 - cos(angle)) / angle2
     for column in range(3):
         x, y, z = rotation[0, column], rotation[1, column], rotation[2, column]
         along = c * (vx * x + vy * y + vz * z)
@@ -177,7 +178,7 @@ def _outlier(
             continue
         drop = (h11 * r0 * r0 - 2.0 * h01 * r0 * r1 + h00 * r1 * r1) / determinant
         others = max(chi2 - drop, 0.0) + prior_freedom
-        tail = (1.0 + drop / max(others, 1e-12)) ** (-0.5 * (rest + prior_freedom))
+        tail = power(1.0 + drop / max(others, 1e-12), -0.5 * (rest + prior_freedom))
         if tail < least:
             worst, least = i, tail
     return worst
@@ -208,7 +209,7 @@ def normal_equations(
             continue
         r0, r1, x, y, z = residual(star_table, detections, rotation, i, stars[i])
         _slopes(detections, i, x, y, z, slopes)
-        weight_u, weight_v = 1.0 / detections[i, SIGMA_U] ** 2, 1.0 / detections[i, SIGMA_V] ** 2
+        weight_u, weight_v = 1.0 / square(detections[i, SIGMA_U]), 1.0 / square(detections[i, SIGMA_V])
         chi2 += weight_u * r0 * r0 + weight_v * r1 * r1
         for a in range(unknowns):
             at_u, at_v = weight_u * slopes[0, a], weight_v * slopes[1, a]
@@ -246,7 +247,7 @@ def distances(
     for i in range(stars.shape[0]):
         if stars[i] >= 0:
             r0, r1, _, _, _ = residual(star_table, detections, rotation, i, stars[i])
-            scratch[m] = math.sqrt((r0 / detections[i, SIGMA_U]) ** 2 + (r1 / detections[i, SIGMA_V]) ** 2)
+            scratch[m] = math.sqrt(square(r0 / detections[i, SIGMA_U]) + square(r1 / detections[i, SIGMA_V]))
             total += r0 * r0 + r1 * r1
             m += 1
     return lower_median(scratch, m) / _RAYLEIGH_MEDIAN, math.sqrt(total / max(m, 1))
@@ -388,7 +389,7 @@ def refine(
             chi2 -= right[k] * step[k]
         rotate_sensor(rotation, step[0], step[1], step[2])
         if free_scale:
-            numbers[SCALE] *= math.exp(step[3])
+            numbers[SCALE] *= exp(step[3])
         _observe_with(raw, observed, settings, rotation, numbers[SCALE], detections)
         freedom = max(2 * matched - unknowns, 1)
         numbers[VARIANCE] = max(chi2, 1e-12) / freedom

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices32
+from starid.elementary import acos, cos
 from starid.kernels.jit import compiled_ieee, inner
 
 FACES: Final = 6
@@ -44,7 +45,7 @@ def _reach(vector: Array, face: int, n: int, margin: float) -> tuple[int, int, i
     """
     axis = face // 2
     depth = vector[axis] if face % 2 == 0 else -vector[axis]
-    if depth < math.cos(min(math.acos(1.0 / math.sqrt(3.0)) + margin, 1.5)):
+    if depth < cos(min(acos(1.0 / math.sqrt(3.0)) + margin, 1.5)):
         return 0, -1, 0, -1
     u = vector[(axis + 1) % 3] / depth
     v = vector[(axis + 2) % 3] / depth

@@ -32,6 +32,7 @@ import numpy as np
 
 from starid.arrays import Array, Indices, Indices32
 from starid.camera.projection import MODEL
+from starid.elementary import exp, log, square
 from starid.identification.geometric.matching import residual
 from starid.identification.geometric.observation import MAGNITUDE, SIGMA_U, SIGMA_V, Table, X, Y, Z, scaled
 from starid.identification.geometric.pattern_index import (
@@ -65,7 +66,7 @@ ACCEPT_ABOVE: Final = 9.0
 MAX_TESTED: Final = 40
 """Largest number of detections tested."""
 
-WHOLE_SKY: Final = (8.0 * math.pi**2, 4.0 * math.pi)
+WHOLE_SKY: Final = (8.0 * square(math.pi), 4.0 * math.pi)
 """Prior for an unknown attitude: volume of all rotations (rad³), solid angle for one star (sr)."""
 
 ZERO_POINT_RANGE: Final = 10.0
@@ -92,7 +93,7 @@ def hit_odds(index: IndexArrays, window_rad: float) -> Array:
     odds = np.empty(bins)
     for b in range(bins):
         chance = min(0.25 * index.counts[sky, b] * window_rad * window_rad + 1e-6, 0.9)
-        odds[b] = math.log(TRUE_SHARE / chance + 1.0 - TRUE_SHARE)
+        odds[b] = log(TRUE_SHARE / chance + 1.0 - TRUE_SHARE)
     return odds
 
 
@@ -145,7 +146,7 @@ def worth_refining(
     stars, grid_start, grid_stars = index.stars, index.grid_start, index.grid_stars
     cells = int(index.numbers[GRID_CELLS])
     limit2 = settings.test_window * settings.test_window
-    miss = math.log(1.0 - TRUE_SHARE)
+    miss = log(1.0 - TRUE_SHARE)
     total = 0.0
     hits = 0
     count = order.shape[0]
@@ -219,28 +220,28 @@ def _log_detections(
             magnitude = star_table[star, STAR_MAGNITUDE]
             r0, r1, _, _, _ = residual(star_table, detections, rotation, i, star)
             su, sv = deviation_of_one * detections[i, SIGMA_U], deviation_of_one * detections[i, SIGMA_V]
-            here = math.exp(-0.5 * ((r0 / su) ** 2 + (r1 / sv) ** 2)) / (2.0 * math.pi * su * sv)
+            here = exp(-0.5 * (square(r0 / su) + square(r1 / sv))) / (2.0 * math.pi * su * sv)
             deviation = (magnitude - detections[i, MAGNITUDE] - numbers[ZERO_POINT]) / scatter
-            brightness = math.exp(-0.5 * deviation * deviation) / (math.sqrt(2.0 * math.pi) * scatter)
+            brightness = exp(-0.5 * deviation * deviation) / (math.sqrt(2.0 * math.pi) * scatter)
             density = _stars_per_magnitude(counts, cell, magnitude)
             gain = field_px * min(brightness / density, 1.0) * here
             least_density = min(least_density, density)
         for k in range(len(SHARES)):
             products[k] *= 1.0 - SHARES[k] + SHARES[k] * gain
             if not _SMALL < products[k] < 1.0 / _SMALL:
-                totals[k] += math.log(products[k])
+                totals[k] += log(products[k])
                 products[k] = 1.0
     for k in range(len(SHARES)):
-        totals[k] += math.log(products[k])
+        totals[k] += log(products[k])
     best = totals[0]
     for k in range(1, len(SHARES)):
         best = max(best, totals[k])
     mean = 0.0
     for k in range(len(SHARES)):
-        mean += math.exp(totals[k] - best) / len(SHARES)
+        mean += exp(totals[k] - best) / len(SHARES)
     likeliest = min(1.0 / (math.sqrt(2.0 * math.pi) * scatter * least_density), 1.0)
     zero_points = math.sqrt(2.0 * math.pi) * scatter / ZERO_POINT_RANGE
-    return float(best + math.log(mean)), field_px * likeliest * zero_points
+    return float(best + log(mean)), field_px * likeliest * zero_points
 
 
 @inner
@@ -254,12 +255,12 @@ def _noise(numbers: Array, freedom: int, has_known_errors: bool) -> tuple[float,
     variance = numbers[VARIANCE]
     if has_known_errors:
         variance = (PRIOR_FREEDOM + variance * freedom) / (PRIOR_FREEDOM + freedom)
-        density = -0.5 * PRIOR_FREEDOM * (math.log(variance) + 1.0 / variance - 1.0)
-        return variance, density + 0.5 * math.log(PRIOR_FREEDOM / (PRIOR_FREEDOM + freedom))
+        density = -0.5 * PRIOR_FREEDOM * (log(variance) + 1.0 / variance - 1.0)
+        return variance, density + 0.5 * log(PRIOR_FREEDOM / (PRIOR_FREEDOM + freedom))
     width = math.sqrt(math.pi / freedom)
     if variance < MIN_NOISE * MIN_NOISE:
         variance, width = MIN_NOISE * MIN_NOISE, 1.0 / freedom
-    return variance, min(math.log(width / math.log(MAX_NOISE / MIN_NOISE)), 0.0)
+    return variance, min(log(width / log(MAX_NOISE / MIN_NOISE)), 0.0)
 
 
 @inner
@@ -299,12 +300,12 @@ def log_false_probability(
         index, detections, rotation, stars, numbers, math.sqrt(variance), settings.field_px
     )
     log_factor += noise_factor
-    half_volume = 1.5 * math.log(2.0 * math.pi * variance) - 0.5 * math.log(determinant)
-    log_factor += min(half_volume - math.log(prior[0]), 0.0)
-    log_factor -= math.log(max(lone / (prior[1] * settings.px_per_rad**2), 1.0))
+    half_volume = 1.5 * log(2.0 * math.pi * variance) - 0.5 * log(determinant)
+    log_factor += min(half_volume - log(prior[0]), 0.0)
+    log_factor -= log(max(lone / (prior[1] * square(settings.px_per_rad)), 1.0))
     scatter = max(numbers[SCATTER], SCATTER_FLOOR)
-    log_factor += min(math.log(math.sqrt(2.0 * math.pi / matched) * scatter / ZERO_POINT_RANGE), 0.0)
+    log_factor += min(log(math.sqrt(2.0 * math.pi / matched) * scatter / ZERO_POINT_RANGE), 0.0)
     if spread > 0.0:
         error = math.sqrt(variance * numbers[SCALE_VARIANCE])
-        log_factor += min(math.log(math.sqrt(2.0 * math.pi) * error / (2.0 * spread)), 0.0)
+        log_factor += min(log(math.sqrt(2.0 * math.pi) * error / (2.0 * spread)), 0.0)
     return min(-log_factor, 0.0)

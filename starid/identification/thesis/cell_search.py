@@ -116,7 +116,7 @@ def make_cell_index(database: FeatureDatabase) -> CellIndex:
     """Sort the stored vectors of a database into the buckets of the tree (0.1 s for five million)."""
     codes, theta = database.features, database.theta
     filled = int(np.count_nonzero(theta != CODE_MAX))
-    levels = math.ceil(math.log2(max(filled / _CELLS_PER_BUCKET, 2.0)))
+    levels = (math.ceil(max(filled / _CELLS_PER_BUCKET, 2.0)) - 1).bit_length()
     depth = min(max(levels, FEATURE_COUNT), MAX_DEPTH)
     rank = np.zeros((FEATURE_COUNT, CODE_MAX + 1), dtype=np.int64)
     low = np.zeros((FEATURE_COUNT, BINS_PER_FEATURE))

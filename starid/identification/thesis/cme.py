@@ -13,8 +13,10 @@ from typing import Final, Literal
 import numpy as np
 
 from starid.arrays import Array, Indices, Mask
+from starid.elementary import atan2, exp, hypot, log, square
 from starid.identification.thesis.false_stars import FilterError, ObservedFrame
 from starid.kernels.jit import compiled, inner_checked
+from starid.matrices import product
 
 MotionModel = Literal["rigid", "affine"]
 
@@ -60,7 +62,7 @@ class CameraMotion:
 
     def apply(self, positions: Array) -> Array:
         """Transform positions (n, 2) in the earlier frame to positions in the later one."""
-        return np.asarray(positions @ self.matrix[:2, :2].T + self.matrix[:2, 2], dtype=np.float64)
+        return np.asarray(product(positions, self.matrix[:2, :2].T) + self.matrix[:2, 2], dtype=np.float64)
 
 
 @inner_checked
@@ -95,7 +97,7 @@ def rigid_fit(before: Array, now: Array, sample: Mask, motion: Array) -> bool:
             v = now[i, 1] - centre[3]
             along += x * u + y * v
             across += x * v - y * u
-    length = math.hypot(along, across)
+    length = hypot(along, across)
     if length <= 0.0:
         return False
     c, s = along / length, across / length
@@ -127,7 +129,7 @@ def affine_fit(before: Array, now: Array, sample: Mask, matrix: Array) -> bool:
             xv += x * v
             yv += y * v
     determinant = xx * yy - xy * xy
-    if determinant <= _COLLINEARITY * (xx + yy) ** 2:
+    if determinant <= _COLLINEARITY * square(xx + yy):
         return False
     matrix[0, 0] = (xu * yy - yu * xy) / determinant
     matrix[0, 1] = (yu * xx - xu * xy) / determinant
@@ -177,10 +179,10 @@ def _negative_log_likelihood(distances: Array, sigma: float) -> float:
         members = 0.0
         cost = 0.0
         for i in range(distances.size):
-            near = share * math.exp(-0.5 * (distances[i] / sigma) ** 2) / (2.0 * math.pi * sigma * sigma)
+            near = share * exp(-0.5 * square(distances[i] / sigma)) / (2.0 * math.pi * sigma * sigma)
             far = (1.0 - share) * wide
             members += near / (near + far)
-            cost -= math.log(near + far)
+            cost -= log(near + far)
         share = min(max(members / distances.size, 0.01), 0.99)
     return cost
 
@@ -313,7 +315,7 @@ def estimate_motion(
     kept = distances[inliers] if inliers.any() else distances
     return CameraMotion(
         np.vstack([matrix, [0.0, 0.0, 1.0]]),
-        math.degrees(math.atan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1])),
+        math.degrees(atan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1])),
         matrix[:, 2].copy(),
         float(kept.mean()),
         float(kept.std(ddof=1)) if kept.size > 1 else 0.0,

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices
+from starid.elementary import atan2, cos, hypot, sin, square
 from starid.identification.thesis.frame_sky import SkyArrays, stars_near
 from starid.kernels.jit import compiled, inner_checked
 
@@ -54,8 +55,8 @@ def vote_roll(
     votes[:] = 0.0
     width = 2.0 * math.pi / ROLL_BINS
     for j in range(count):
-        r = math.sqrt(near[j, 0] ** 2 + near[j, 1] ** 2)
-        angle = math.atan2(near[j, 1], near[j, 0])
+        r = math.sqrt(square(near[j, 0]) + square(near[j, 1]))
+        angle = atan2(near[j, 1], near[j, 0])
         for i in range(observed.shape[0]):
             if abs(polar[i, 0] - r) > offset_px or polar[i, 0] < _INNERMOST * offset_px:
                 continue
@@ -89,7 +90,7 @@ def pair_stars(
 
     `pairs` (n, 2) receives the observed star and the index in `near`.
     """
-    c, s, x, y = math.cos(turn), math.sin(turn), 0.0, 0.0
+    c, s, x, y = cos(turn), sin(turn), 0.0, 0.0
     pair_count = 0
     tolerance = tolerance_px
     for _ in range(_REFITS):
@@ -127,7 +128,7 @@ def pair_stars(
             q = observed[pairs[k, 0], 1] - sums[3]
             along += u * p + v * q
             across += u * q - v * p
-        length = math.hypot(along, across)
+        length = hypot(along, across)
         if length <= 0.0:
             return 0
         c, s = along / length, across / length
@@ -165,8 +166,8 @@ def next_candidate(
     n = observed.shape[0]
     polar = np.empty((n, 2))
     for i in range(n):
-        polar[i, 0] = math.sqrt(observed[i, 0] ** 2 + observed[i, 1] ** 2)
-        polar[i, 1] = math.atan2(observed[i, 1], observed[i, 0])
+        polar[i, 0] = math.sqrt(square(observed[i, 0]) + square(observed[i, 1]))
+        polar[i, 1] = atan2(observed[i, 1], observed[i, 0])
     near = np.empty((MAX_STARS, 3))
     rows = np.empty(MAX_STARS, dtype=np.int64)
     votes = np.empty(ROLL_BINS)

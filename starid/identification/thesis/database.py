@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from starid.arrays import Array
 from starid.camera import Camera
 from starid.catalog import Band, StarCatalog
+from starid.elementary import atan2, hypot, tan
 from starid.errors import StaridError
 from starid.identification.thesis.features import FEATURE_COUNT, FeatureVector
 from starid.identification.thesis.frame_grid import FrameGrid, Geometry, GridArrays, make_grid
@@ -95,7 +96,7 @@ class DatabaseParameters:
         half = 0.5 + min(cx, camera.width - 1 - cx, cy, camera.height - 1 - cy)
         edge = np.array([[cx + half, cy]])
         direction_of_edge = camera.back_project(edge)[0]
-        angle = math.atan2(math.hypot(direction_of_edge[0], direction_of_edge[1]), direction_of_edge[2])
+        angle = atan2(hypot(direction_of_edge[0], direction_of_edge[1]), direction_of_edge[2])
         if not (half > 0.0 and angle < _WIDEST_HALF_FIELD):
             raise DatabaseError(
                 "database: features are gnomonic and need a camera with a field of less than 120°"
@@ -109,7 +110,7 @@ class DatabaseParameters:
             band,
             full_field=full_field,
             focal_px=focal,
-            half_width_px=focal * math.tan(angle),
+            half_width_px=focal * tan(angle),
         )
 
     @classmethod

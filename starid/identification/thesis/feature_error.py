@@ -13,8 +13,10 @@ from typing import Final, Self
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arrays import Array, elementwise
 from starid.attitude import Attitude, random_attitude
+from starid.catalog.photometry import flux_ratio
+from starid.elementary import exp, hypot, log, square
 from starid.identification.thesis.feature_search import FeatureSearch
 from starid.identification.thesis.features import FeatureVector
 
@@ -49,9 +51,9 @@ class Photometry:
 
     def measured(self, rng: np.random.Generator, magnitude: Array) -> Array:
         """Magnitudes as measured, infinite for stars that are not found."""
-        sigma = np.hypot(_FLOOR_MAG, self.sigma * 10.0 ** (0.4 * (magnitude - self.limit)))
-        slope = math.log(9.0) / _SLOPE_MAG
-        found = 1.0 / (1.0 + np.exp(slope * (magnitude - self.limit - _SLOPE_MAG)))
+        sigma = np.sqrt(square(_FLOOR_MAG) + square(self.sigma * flux_ratio(self.limit - magnitude)))
+        slope = log(9.0) / _SLOPE_MAG
+        found = 1.0 / (1.0 + elementwise(exp, slope * (magnitude - self.limit - _SLOPE_MAG)))
         seen = rng.uniform(size=magnitude.size) < found
         return np.asarray(
             np.where(seen, magnitude + sigma * rng.normal(size=magnitude.size), np.inf), dtype=np.float64
@@ -117,9 +119,9 @@ class FeatureErrors:
                 else search.answer_in_region(later, answer.attitude.rotated(move), side_deg)
             )
             if local is not None:
-                errors_psi = elsewhere if math.hypot(*errors[-1][:2]) > math.radians(RIGHT_DEG) else here
+                errors_psi = elsewhere if hypot(*errors[-1][:2]) > math.radians(RIGHT_DEG) else here
                 errors_psi.append(local.error_psi)
-        squares = np.array(errors) ** 2
+        squares = square(np.array(errors))
         upper = np.quantile(psi, np.arange(1, _CLASSES + 1) / _CLASSES)
         upper[-1] = math.inf
         rows = np.searchsorted(upper, psi)
@@ -146,5 +148,5 @@ def _features_at(
 def _mean_squares(squares: Array) -> Array:
     """Mean of squared rotations (n, 3) across and about the boresight, (2,); that of a degree if there are none."""
     if len(squares) == 0:
-        return np.full(2, math.radians(RIGHT_DEG) ** 2)
+        return np.full(2, square(math.radians(RIGHT_DEG)))
     return np.array([squares[:, :2].mean(), squares[:, 2].mean()])

@@ -7,23 +7,25 @@ field is searched in several narrower circles, of which some contain no covered 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask
+from starid.arrays import Array, Indices, Mask, elementwise
 from starid.attitude import Attitude
 from starid.attitude.wahba import solve_wahba
 from starid.camera import Camera
+from starid.elementary import cos, log10, sin, square
 from starid.identification.thesis.coarse_match import next_candidate
 from starid.identification.thesis.database import FeatureDatabase
 from starid.identification.thesis.features import FeatureVector, extract_features
 from starid.identification.thesis.frame_sky import UX, UZ, FrameSky
 from starid.identification.thesis.lsi import LostInSpace, LsiEstimate, LsiSolution
 from starid.identification.thesis.search_spots import Spots, places_not_tried
+from starid.matrices import product
 
 MIN_STARS: Final = 3
 """Fewest stars of a field that has features."""
@@ -118,6 +120,8 @@ class FeatureSearch:
         Rotation (3, 3) that carries the centre of the circle to the boresight.
     stars
         The stars with which the detections of a candidate are paired, fainter ones than those of the features too.
+    extract
+        Features of magnitudes (n,) and offsets from the centre of the circle (n, 2), pixels.
     """
 
     camera: Camera
@@ -125,6 +129,7 @@ class FeatureSearch:
     neighbours: int
     turn: Array
     stars: FrameSky
+    extract: Callable[[Array, Array], FeatureVector] = extract_features
 
     @property
     def database(self) -> FeatureDatabase:
@@ -138,12 +143,14 @@ class FeatureSearch:
     def field_stars(self, xy: Array, flux: Array, zero_point: float) -> FieldStars:
         """Detections with flux in the circular field of the features, brightest first."""
         rows = np.flatnonzero(flux > 0.0)
-        directions = self.camera.back_project(xy[rows]) @ self.turn.T
+        directions = product(self.camera.back_project(xy[rows]), self.turn.T)
         with np.errstate(invalid="ignore", divide="ignore"):
             place = self.database.parameters.focal_px * directions[:, :2] / directions[:, 2:3]
-            inside = np.sum(place**2, axis=1) <= self._half_width_px**2
+            inside = np.sum(square(place), axis=1) <= square(self._half_width_px)
         inside &= directions[:, 2] > 0.0
-        return self.field_of(place[inside], zero_point - 2.5 * np.log10(flux[rows[inside]]), rows[inside])
+        return self.field_of(
+            place[inside], zero_point - 2.5 * elementwise(log10, flux[rows[inside]]), rows[inside]
+        )
 
     def field_of(self, place: Array, magnitude: Array, row: Indices | None = None) -> FieldStars:
         """The same from offsets (n, 2), pixels, and magnitudes (n,); stars of infinite magnitude are left out."""
@@ -159,14 +166,14 @@ class FeatureSearch:
     def features(self, field: FieldStars) -> FeatureVector | None:
         """Feature vector of the stars within the brightness limit; None if there are too few."""
         count = self.bright(field)
-        return None if count < MIN_STARS else extract_features(field.magnitude[:count], field.place[:count])
+        return None if count < MIN_STARS else self.extract(field.magnitude[:count], field.place[:count])
 
     def doubtful_features(self, field: FieldStars) -> list[FeatureVector]:
         """Feature vectors with some stars fewer or more, those nearest the brightness limit; the likeliest first."""
         count = self.bright(field)
         counts = [count + change for change in _COUNT_CHANGES]
         return [
-            extract_features(field.magnitude[:n], field.place[:n])
+            self.extract(field.magnitude[:n], field.place[:n])
             for n in counts
             if MIN_STARS <= n <= field.magnitude.size
         ]
@@ -180,7 +187,7 @@ class FeatureSearch:
     ) -> FeatureAnswer | None:
         """The same with the nearest cell of a region; None if the region has no cell."""
         lsi, observation = self.lost_in_space, self.database.normalise(features)
-        middle = Attitude.from_matrix(self.turn @ centre.matrix)
+        middle = Attitude.from_matrix(product(self.turn, centre.matrix))
         cell, distance, _ = lsi.nearest_in_region(observation, middle.ra_deg, middle.dec_deg, side_deg)
         if cell < 0:
             return None
@@ -189,10 +196,10 @@ class FeatureSearch:
     def answer_of(self, solution: LsiSolution, features: FeatureVector) -> FeatureAnswer:
         """Boresight and roll of a solution: the pointers of features and estimate are laid on each other."""
         estimate = solution.mse
-        x, y = math.cos(features.theta_rad), math.sin(features.theta_rad)
+        x, y = cos(features.theta_rad), sin(features.theta_rad)
         across = np.cross(estimate.boresight, estimate.pointer)
         rows = [x * estimate.pointer - y * across, y * estimate.pointer + x * across, estimate.boresight]
-        return FeatureAnswer(solution, estimate, Attitude.from_matrix(self.turn.T @ np.stack(rows)))
+        return FeatureAnswer(solution, estimate, Attitude.from_matrix(product(self.turn.T, np.stack(rows))))
 
     def attitudes_of(
         self, field: FieldStars, observations: Sequence[FeatureVector]
@@ -236,5 +243,5 @@ class FeatureSearch:
             seen = field.place[matched[:count, 0]]
             body = np.column_stack([seen, np.full(count, self.database.parameters.focal_px)])
             icrs = self.stars.stars[matched[:count, 1], UX : UZ + 1]
-            yield solve_wahba(body @ self.turn, icrs), place + 1 - start
+            yield solve_wahba(product(body, self.turn), icrs), place + 1 - start
             start = place + 1

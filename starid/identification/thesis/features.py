@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array
+from starid.elementary import atan2, cos, sin
 from starid.errors import StaridError
 from starid.kernels.jit import compiled, inner_checked
 
@@ -116,7 +117,7 @@ def finish_features(sums: Array, pivot: float, out: Array) -> float:
     if n > 1.0:
         out[3] = math.sqrt(max(sums[2] - n * mean_difference * mean_difference, 0.0) / (n - 1.0))
         out[4] = math.sqrt(max(sums[6] - sums[5] * sums[5] / n, 0.0) / (n - 1.0))
-    return math.atan2(y, x)
+    return atan2(y, x)
 
 
 @compiled
@@ -180,5 +181,5 @@ def extract_features(
 def feature_vector(numbers: Array, theta_rad: float) -> FeatureVector:
     """Make a feature vector from the output of `finish_features`."""
     n, mean, r, sigma_a, sigma_r = numbers.tolist()
-    x, y = r * math.cos(theta_rad), r * math.sin(theta_rad)
+    x, y = r * cos(theta_rad), r * sin(theta_rad)
     return FeatureVector(int(n), mean, r, sigma_a, sigma_r, theta_rad, x, y)

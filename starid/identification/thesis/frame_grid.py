@@ -8,7 +8,8 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arrays import Array, Indices, elementwise
+from starid.elementary import cos, square
 from starid.errors import StaridError
 from starid.kernels.jit import compiled, inner_checked
 
@@ -180,7 +181,7 @@ def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:
     if not (math.isfinite(fov_deg) and 0.0 < fov_deg <= 120.0):
         raise GridError(f"grid: frames cannot be {fov_deg}° wide; give more than 0° and at most 120°")
     step = fov_deg * (1.0 - overlap)
-    if not MAX_CELLS * step**2 >= _FULL_TURN * 180.0:
+    if not MAX_CELLS * square(step) >= _FULL_TURN * 180.0:
         raise GridError(
             f"grid: frames {fov_deg}° wide that overlap by {100.0 * overlap:.9g} % number more than {MAX_CELLS} over the whole "
             "sky; give less overlap or wider frames"
@@ -195,7 +196,9 @@ def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:
     elif geometry == "spherical":
         rows = math.ceil(180.0 / step)
         dec = -90.0 + (np.arange(rows) + 0.5) * (180.0 / rows)
-        row_columns = np.maximum(np.rint(_FULL_TURN * np.cos(np.radians(dec)) / step), 3).astype(np.int64)
+        row_columns = np.maximum(np.rint(_FULL_TURN * elementwise(cos, np.radians(dec)) / step), 3).astype(
+            np.int64
+        )
         ra_step = np.asarray(_FULL_TURN / row_columns, dtype=np.float64)
         first_ra = 0.0
     else:
@@ -210,7 +213,7 @@ def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:
 def nominal_cells(fov_deg: float, overlap: float) -> float:
     """Nominal number of cells N = 2π² / (φ_x·φ_y·(1 − p)²), eq. 2.23, with φ_x = φ_y = `fov_deg`."""
     fov = math.radians(fov_deg)
-    return 2.0 * math.pi**2 / (fov * (1.0 - overlap)) ** 2
+    return 2.0 * square(math.pi) / square(fov * (1.0 - overlap))
 
 
 def circle_intrusion(radius: float) -> float:

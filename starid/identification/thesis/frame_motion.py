@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices
+from starid.elementary import atan2, cos, sin, square
 from starid.kernels.jit import compiled, inner_checked
 
 MAX_VOTERS: Final = 48
@@ -82,7 +83,7 @@ def _pairs(
             length = math.sqrt(dx * dx + dy * dy)
             if length >= least:
                 separation[k] = length
-                slope[k] = math.atan2(dy, dx)
+                slope[k] = atan2(dy, dx)
                 members[k, 0] = first
                 members[k, 1] = second
                 k += 1
@@ -179,7 +180,7 @@ def find_motion(
     motion
         In: a first guess; out: cosine, sine, shift x, shift y.
     """
-    gate2 = (_GATE * sigma) ** 2
+    gate2 = square(_GATE * sigma)
     faint = _GATE * brightness_sigma
     best = _score(before, brightness_before, now, brightness_now, motion, gate2, faint)
     sizes = (MAX_VOTERS * MAX_VOTERS, MAX_VOTERS * MAX_VOTERS)
@@ -202,8 +203,8 @@ def find_motion(
         a, b = first[2][couple[0], 0], first[2][couple[0], 1]
         c, d = second[2][couple[1], 0], second[2][couple[1], 1]
         turn = second[1][couple[1]] - first[1][couple[0]]
-        trial[0] = math.cos(turn)
-        trial[1] = math.sin(turn)
+        trial[0] = cos(turn)
+        trial[1] = sin(turn)
         mx, my = 0.5 * (before[a, 0] + before[b, 0]), 0.5 * (before[a, 1] + before[b, 1])
         trial[2] = 0.5 * (now[c, 0] + now[d, 0]) - trial[0] * mx + trial[1] * my
         trial[3] = 0.5 * (now[c, 1] + now[d, 1]) - trial[1] * mx - trial[0] * my

@@ -9,7 +9,8 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arrays import Array, Indices, elementwise
+from starid.elementary import asin, atan, cos, sin, square
 from starid.errors import StaridError
 from starid.identification.thesis.features import (
     SUM_COUNT,
@@ -58,8 +59,8 @@ def bins_near(ra_deg: float, dec_deg: float, reach_deg: float, spherical: bool) 
     if spherical:
         window = 180.0
         if abs(dec_deg) + reach_deg < 90.0:
-            ratio = math.sin(math.radians(reach_deg)) / math.cos(math.radians(dec_deg))
-            window = math.degrees(math.asin(min(ratio, 1.0)))
+            ratio = sin(math.radians(reach_deg)) / cos(math.radians(dec_deg))
+            window = math.degrees(asin(min(ratio, 1.0)))
     first = math.floor((ra_deg - window) / BIN_DEG)
     count = min(math.floor((ra_deg + window) / BIN_DEG) - first + 1, RA_BINS)
     return low, high, first % RA_BINS, count
@@ -80,7 +81,7 @@ def stars_of_bins(bin_start: Indices, band: int, first: int, count: int, part: i
 def position_cosines(ra_deg: float, dec_deg: float) -> tuple[float, float, float, float]:
     """Cosines and sines of α and δ of a position."""
     a, d = math.radians(ra_deg), math.radians(dec_deg)
-    return math.cos(a), math.sin(a), math.cos(d), math.sin(d)
+    return cos(a), sin(a), cos(d), sin(d)
 
 
 @compiled
@@ -141,10 +142,10 @@ def stars_near(
     """
     stars, bin_start, frame = sky
     spherical = frame[SPHERICAL] > 0.5
-    limit = (frame[HALF_WIDTH] + margin) ** 2
+    limit = square(frame[HALF_WIDTH] + margin)
     reach = frame[HALF_WIDTH] + margin
     if spherical:
-        reach = math.degrees(math.atan(reach / frame[FOCAL]))
+        reach = math.degrees(atan(reach / frame[FOCAL]))
     turn = position_cosines(ra_deg, dec_deg)
     low, high, first, bins = bins_near(ra_deg, dec_deg, reach, spherical)
     count = 0
@@ -209,7 +210,7 @@ class FrameSky:
         reach = self.half_width
         corner = math.sqrt(2.0) if self.full_field else 1.0
         if self.geometry == "spherical":
-            reach = math.degrees(math.atan(corner * self.half_width / self.focal_px))
+            reach = math.degrees(atan(corner * self.half_width / self.focal_px))
         pivot = float(np.median(self.stars[:, BRIGHTNESS])) if self.stars.size else 0.0
         return np.array(
             [
@@ -258,10 +259,10 @@ class FrameSky:
             x = self.stars[:, RIGHT_ASCENSION] - ra_deg
             return x - 360.0 * np.rint(x / 360.0), self.stars[:, DECLINATION] - dec_deg
         a, d = math.radians(ra_deg), math.radians(dec_deg)
-        east = math.cos(a) * self.stars[:, UY] - math.sin(a) * self.stars[:, UX]
-        level = math.cos(a) * self.stars[:, UX] + math.sin(a) * self.stars[:, UY]
-        depth = math.cos(d) * level + math.sin(d) * self.stars[:, UZ]
-        north = math.cos(d) * self.stars[:, UZ] - math.sin(d) * level
+        east = cos(a) * self.stars[:, UY] - sin(a) * self.stars[:, UX]
+        level = cos(a) * self.stars[:, UX] + sin(a) * self.stars[:, UY]
+        depth = cos(d) * level + sin(d) * self.stars[:, UZ]
+        north = cos(d) * self.stars[:, UZ] - sin(d) * level
         ahead = depth > 0.0
         scale = np.where(ahead, self.focal_px / np.where(ahead, depth, 1.0), np.inf)
         with np.errstate(invalid="ignore"):
@@ -315,9 +316,8 @@ def make_frame_sky(
     place = np.clip(np.floor(ra / BIN_DEG), 0, RA_BINS - 1).astype(np.int64)
     bins = band * RA_BINS + place
     order = np.argsort(bins, kind="stable")
-    table = np.column_stack(
-        [brightness[source], ra, dec, np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)]
-    )
+    (ca, sa), (cd, sd) = ([elementwise(function, angles) for function in (cos, sin)] for angles in (a, d))
+    table = np.column_stack([brightness[source], ra, dec, cd * ca, cd * sa, sd])
     bin_start = np.searchsorted(bins[order], np.arange(DEC_BINS * RA_BINS + 1)).astype(np.int64)
     return FrameSky(
         geometry,

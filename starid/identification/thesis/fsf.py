@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices, Mask
+from starid.elementary import atan2, square
 from starid.identification.thesis.false_stars import FilterError, FilterResult, ObservedFrame
 from starid.kernels.jit import compiled, inner_checked
 
@@ -47,7 +48,7 @@ def pair_features(brightness: Array, positions: Array, vectors: Array, members: 
             dy = positions[j, 1] - positions[i, 1]
             vectors[k, 0] = 0.5 * (brightness[i] + brightness[j])
             vectors[k, 1] = math.sqrt(dx * dx + dy * dy)
-            vectors[k, 2] = math.degrees(math.atan2(dy, dx)) % 180.0
+            vectors[k, 2] = math.degrees(atan2(dy, dx)) % 180.0
             members[k, 0] = i
             members[k, 1] = j
             k += 1
@@ -122,8 +123,8 @@ def _neighbours(
         begin = start[r * shape[1] + max(column - 1, 0)]
         end = start[r * shape[1] + min(column + 1, shape[1] - 1) + 1]
         for k in range(begin, end):
-            square = (points[k, 0] - a) ** 2 + (points[k, 1] - b) ** 2 + (points[k, 2] - c) ** 2
-            if square <= limit:
+            distance2 = square(points[k, 0] - a) + square(points[k, 1] - b) + square(points[k, 2] - c)
+            if distance2 <= limit:
                 neighbours[count] = k
                 count += 1
     return count

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices, Mask
+from starid.elementary import square
 from starid.kernels.jit import compiled, inner_checked
 
 LAMBDAS: Final[Array] = np.arange(1, 101, dtype=np.float64) * np.float64(0.05)
@@ -302,7 +303,7 @@ def choose_lambdas(dictionary: Array, observation: Array, weights: Array, error:
             best = i
             spread = 0.0
             for f in range(features):
-                spread += (squared[f] - error[i]) ** 2
+                spread += square(squared[f] - error[i])
             spread = math.sqrt(spread / (features - 1) / features)
     largest = best
     for i in range(weights.shape[0]):

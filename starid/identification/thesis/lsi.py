@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final, Literal, NamedTuple, get_args
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices
+from starid.elementary import atan2, cos, hypot, sin, square
 from starid.identification.options import Solver
 from starid.identification.thesis.cell_search import (
     CellArrays,
@@ -28,8 +30,10 @@ from starid.identification.thesis.lasso import LAMBDAS, choose_lambdas, lasso_pa
 from starid.identification.thesis.matlab_lasso import matlab_path
 from starid.identification.thesis.reference import ReferenceSearch, reference_path
 from starid.kernels.jit import compiled, inner_checked
+from starid.matrices import product
 
 Precision = Literal["exact", "stored"]
+LassoPath = Callable[[Array, Array], Array]
 
 _WHOLE_SKY_DEG: Final = 720.0
 _CODES_PER_RADIAN: Final = 255.0 / (2.0 * math.pi)
@@ -181,7 +185,7 @@ class LsiSolution:
             omega,
             float(numbers[LAMBDA]),
             float(numbers[ERROR]),
-            self.dictionary @ omega,
+            product(self.dictionary, omega),
             numbers[BORESIGHT : BORESIGHT + 3],
             numbers[POINTER : POINTER + 3],
         )
@@ -216,11 +220,11 @@ def _flat_estimate(omega: Array, work: LsiWork, result: Array) -> None:
     for j in range(9):
         ra += omega[j] * work.places[0, j]
         dec += omega[j] * work.places[1, j]
-        cos_sum += omega[j] * math.cos(work.places[2, j])
-        sin_sum += omega[j] * math.sin(work.places[2, j])
+        cos_sum += omega[j] * cos(work.places[2, j])
+        sin_sum += omega[j] * sin(work.places[2, j])
     result[1] = (ra / result[0]) % 360.0
     result[2] = dec / result[0]
-    result[3] = math.atan2(sin_sum, cos_sum)
+    result[3] = atan2(sin_sum, cos_sum)
 
 
 @inner_checked
@@ -231,29 +235,29 @@ def _sphere_estimate(omega: Array, work: LsiWork, result: Array) -> None:
     for j in range(9):
         a = math.radians(work.places[0, j])
         d = math.radians(work.places[1, j])
-        ca, sa, cd, sd = math.cos(a), math.sin(a), math.cos(d), math.sin(d)
-        east = -math.cos(work.places[2, j])
-        north = -math.sin(work.places[2, j])
+        ca, sa, cd, sd = cos(a), sin(a), cos(d), sin(d)
+        east = -cos(work.places[2, j])
+        north = -sin(work.places[2, j])
         boresight[0] += omega[j] * cd * ca
         boresight[1] += omega[j] * cd * sa
         boresight[2] += omega[j] * sd
         pointer[0] += omega[j] * (-east * sa - north * sd * ca)
         pointer[1] += omega[j] * (east * ca - north * sd * sa)
         pointer[2] += omega[j] * north * cd
-    boresight /= math.sqrt((boresight**2).sum())
+    boresight /= math.sqrt((square(boresight)).sum())
     pointer -= boresight * (pointer * boresight).sum()
-    length = math.sqrt((pointer**2).sum())
-    level = math.hypot(boresight[0], boresight[1])
+    length = math.sqrt((square(pointer)).sum())
+    level = hypot(boresight[0], boresight[1])
     ca, sa = (boresight[0] / level, boresight[1] / level) if level > 0.0 else (1.0, 0.0)
-    result[1] = math.degrees(math.atan2(sa, ca)) % 360.0
-    result[2] = math.degrees(math.atan2(boresight[2], level))
+    result[1] = math.degrees(atan2(sa, ca)) % 360.0
+    result[2] = math.degrees(atan2(boresight[2], level))
     if length < 1e-12:
         pointer[:] = (sa, -ca, 0.0)
         length = 1.0
     pointer /= length
     north = -pointer[0] * boresight[2] * ca - pointer[1] * boresight[2] * sa + pointer[2] * level
     east = pointer[1] * ca - pointer[0] * sa
-    result[3] = math.atan2(-north, -east)
+    result[3] = atan2(-north, -east)
     result[6:9] = boresight
     result[9:12] = pointer
 
@@ -380,7 +384,7 @@ def region_nearest(
         columns = grid.row_columns[row]
         width = half
         if arrays.sky.frame[0] > 0.5:
-            width = half / max(math.cos(math.radians(grid.row_dec[row])), half / 180.0)
+            width = half / max(cos(math.radians(grid.row_dec[row])), half / 180.0)
         first = math.ceil((ra_deg - width - grid.first_ra) / step)
         last = min(math.floor((ra_deg + width - grid.first_ra) / step), first + columns - 1)
         for place in range(first, last + 1):
@@ -396,7 +400,7 @@ def region_nearest(
                 if d >= best:
                     break
             if counts_angle:
-                d += _angle_gap(searched.theta[cell], theta_code, slack) ** 2
+                d += square(_angle_gap(searched.theta[cell], theta_code, slack))
             if d >= best:
                 continue
             if searched.exact:
@@ -406,7 +410,7 @@ def region_nearest(
                     gap = (vector[f] - observation[f]) * 2.55
                     d += gap * gap
                 if counts_angle:
-                    d += _angle_gap(angle * _CODES_PER_RADIAN, theta_code, 0.0) ** 2
+                    d += square(_angle_gap(angle * _CODES_PER_RADIAN, theta_code, 0.0))
             if d < best:
                 best = d
                 best_cell = cell
@@ -432,6 +436,9 @@ class LostInSpace:
             "exact": the exact path of the LASSO. "matlab": as MATLAB's function `lasso` solves it by default,
             as for the published accuracy. "sklearn": nearest neighbours over the whole database and the LASSO
             of scikit-learn; the same answers, hundreds of times slower (`starid.identification.thesis.reference`).
+    weights
+        Another LASSO: from dictionary (5, 9) and observation (5,) to weights (k, 9), one row for each λ of `LAMBDAS`. By
+        default that of the solver.
 
     Raises
     ------
@@ -440,7 +447,12 @@ class LostInSpace:
     """
 
     def __init__(
-        self, database: FeatureDatabase, *, precision: Precision = "exact", solver: Solver = "exact"
+        self,
+        database: FeatureDatabase,
+        *,
+        precision: Precision = "exact",
+        solver: Solver = "exact",
+        weights: LassoPath | None = None,
     ) -> None:
         if precision not in ("exact", "stored"):
             raise DatabaseError(f"LSI: precision must be exact or stored, not {precision!r}")
@@ -453,6 +465,7 @@ class LostInSpace:
             self.arrays, database.features, database.theta, precision == "exact", solver == "matlab"
         )
         self._reference = ReferenceSearch(database) if solver == "sklearn" else None
+        self._weights = weights or (None if self._reference is None else reference_path)
 
     def solve(self, features: FeatureVector) -> LsiSolution:
         """Estimate boresight and roll from the features of a frame, searching the whole database."""
@@ -466,7 +479,7 @@ class LostInSpace:
         DatabaseError
             The observation is not five finite numbers.
         """
-        if self._reference is not None:
+        if self._weights is not None:
             return self.estimate(observation, *self.nearest(observation))
         self._check(observation)
         work = lsi_work()
@@ -520,11 +533,11 @@ class LostInSpace:
         """Compute dictionary, LASSO and estimates for a given cell."""
         self._check(observation)
         work = lsi_work()
-        if self._reference is None:
+        if self._weights is None:
             estimate_from_cell(self.searched, cell, observation, LAMBDAS, work)
         else:
             fill_dictionary(self.searched, cell, work)
-            path = reference_path(work.dictionary, observation)
+            path = self._weights(work.dictionary, observation)
             chosen = choose_lambdas(work.dictionary, observation, path, np.empty(LAMBDAS.size))
             estimate_from_path(self.searched, cell, observation, LAMBDAS, path, chosen, work)
         return _solution(observation, cell, distance, work)

@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from starid.arrays import Array, Mask
+from starid.arrays import Array, Mask, elementwise
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
+from starid.elementary import cos, log10, sin, tan
 from starid.errors import StaridError
 from starid.identification.geometric.identifier import Identifier
 from starid.identification.geometric.pattern_index import resolved_stars
@@ -45,6 +45,7 @@ from starid.identification.thesis.feature_search import (
     FieldStars,
 )
 from starid.identification.thesis.lsi import LostInSpace
+from starid.identification.thesis.parts import Parts
 
 STARS_PER_FIELD: Final = 10
 """Number of stars per field for the default brightness limit of the features: fewer make fields alike, and with more
@@ -100,6 +101,8 @@ class LsiIdentifier(VerifiedIdentifier):
         By default all of Hipparcos at its default epoch.
     options
         By default `LsiOptions()`.
+    parts
+        The parts of the algorithm; by default those of the thesis.
     **changes
         Fields of `LsiOptions` to change.
 
@@ -116,16 +119,17 @@ class LsiIdentifier(VerifiedIdentifier):
         camera: Camera = DEFAULT_CAMERA,
         catalog: StarCatalog | None = None,
         options: LsiOptions | None = None,
+        parts: Parts | None = None,
         **changes: Any,
     ) -> None:
         options = dataclasses.replace(options or LsiOptions(), **changes)
         super().__init__(camera, catalog)
         if len(self._catalog) == 0:
             raise StaridError("identifier catalog: contains no stars")
-        self.options = options
+        self.options, self._parts = options, parts or Parts()
         self._sensor_magnitudes = _sensor_magnitudes(self._catalog, options.colour_term)
         probe = DatabaseParameters.for_camera(camera, overlap=options.overlap, kappa=0.0)
-        share = 0.5 * (1.0 - math.cos(math.radians(0.5 * probe.fov_deg)))
+        share = 0.5 * (1.0 - cos(math.radians(0.5 * probe.fov_deg)))
         parameters = dataclasses.replace(probe, kappa=self._feature_limit(share))
         deep = max(self._limit_for(STARS_PER_MATCH, share), parameters.kappa)
         if options.detected_limit is not None:
@@ -141,10 +145,11 @@ class LsiIdentifier(VerifiedIdentifier):
         stars = sky_of(sensor_stars, dataclasses.replace(parameters, kappa=deep))
         self.search = FeatureSearch(
             camera,
-            LostInSpace(self.database, solver=options.solver),
+            LostInSpace(self.database, solver=options.solver, weights=self._parts.weights),
             options.neighbours,
             np.identity(3),
             stars,
+            self._parts.features,
         )
         self._circles = self._divided(sensor_stars, deep) if options.divided else []
         self._given_zero_point = options.zero_point
@@ -178,26 +183,24 @@ class LsiIdentifier(VerifiedIdentifier):
         """The searches of nine circles of the field, which share a database: the middle, and eight around it."""
         whole = self.database.parameters
         half = _CIRCLE_SHARE * math.radians(0.5 * whole.fov_deg)
-        share = 0.5 * (1.0 - math.cos(half))
+        share = 0.5 * (1.0 - cos(half))
         parameters = dataclasses.replace(
             whole,
             fov_deg=_CIRCLE_SHARE * whole.fov_deg,
-            half_width_px=whole.focal_px * math.tan(half),
+            half_width_px=whole.focal_px * tan(half),
             overlap=1.0 - (1.0 - whole.overlap) / _CIRCLE_SHARE,
             kappa=self._feature_limit(share),
         )
         deep = max(deep, parameters.kappa)
         database = obtain_database(sensor_stars, parameters, cache=self.options.cache)
-        lost_in_space = LostInSpace(database, solver=self.options.solver)
+        lost_in_space = LostInSpace(database, solver=self.options.solver, weights=self._parts.weights)
         stars = sky_of(sensor_stars, dataclasses.replace(parameters, kappa=deep))
-        ring = [
-            half * np.array([math.sin(turn), -math.cos(turn), 0.0]) for turn in np.arange(8) * math.pi / 4.0
-        ]
+        ring = [half * np.array([sin(turn), -cos(turn), 0.0]) for turn in np.arange(8) * math.pi / 4.0]
         return [
             dataclasses.replace(
                 self.search,
                 lost_in_space=lost_in_space,
-                turn=Rotation.from_rotvec(away).as_matrix(),
+                turn=Attitude.identity().rotated(-away).matrix,
                 stars=stars,
             )
             for away in (np.zeros(3), *ring)
@@ -383,14 +386,14 @@ class LsiIdentifier(VerifiedIdentifier):
         if bright.size < MIN_STARS:
             return shown
         rank = min(_ZERO_POINT_STAR, bright.size) - 1
-        guess = self._star_magnitude + 2.5 * math.log10(float(bright[rank]))
+        guess = self._star_magnitude + 2.5 * log10(float(bright[rank]))
         return shown + [guess + step for step in _ZERO_POINT_STEPS]
 
     def learn(self, solution: Solution, flux: Array) -> None:
         """Learn the zero point from the matched stars of a valid answer, if none was given."""
         if self._given_zero_point is None and solution.star_count >= MIN_STARS:
             magnitudes = self._sensor_magnitudes[solution.catalog_index]
-            found = magnitudes + 2.5 * np.log10(np.maximum(flux[solution.detection_index], 1e-30))
+            found = magnitudes + 2.5 * elementwise(log10, np.maximum(flux[solution.detection_index], 1e-30))
             self._zero_point = float(np.median(found))
 
 

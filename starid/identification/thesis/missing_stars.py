@@ -16,13 +16,15 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arrays import Array, elementwise
+from starid.elementary import cos, sin, square
 from starid.identification.thesis.cme import CameraMotion
 from starid.identification.thesis.database import DatabaseError
 from starid.identification.thesis.false_stars import FilterResult, ObservedFrame
 from starid.identification.thesis.features import extract_features
 from starid.identification.thesis.lsi import LostInSpace
 from starid.identification.thesis.metrics import boresight_error
+from starid.matrices import lengths
 
 MAX_ERROR_PSI: Final = 2.0
 """Largest ε_ψ of a circle that votes; beyond it, its features fit no cell."""
@@ -54,7 +56,7 @@ def restore_missing(
     matched = np.zeros(len(before), dtype=np.bool_)
     matched[result.matches[:, 0]] = True
     predicted = motion.apply(before.positions)
-    inside = np.hypot(*predicted.T) <= radius_deg - margin_deg
+    inside = lengths(predicted) <= radius_deg - margin_deg
     lost = result.true_before & ~matched & inside
     return ObservedFrame(
         np.concatenate([now.brightness[result.true_now], before.brightness[lost]]),
@@ -118,7 +120,7 @@ class DividedField:
     def centres(self) -> Array:
         """Centres of the circles, (9, 2) degrees: the middle, and eight around it."""
         turns = np.arange(8) * (math.pi / 4.0)
-        ring = self._offset * np.column_stack([np.cos(turns), np.sin(turns)])
+        ring = self._offset * np.column_stack([elementwise(cos, turns), elementwise(sin, turns)])
         return np.concatenate([np.zeros((1, 2)), ring])
 
     def answers(self, frame: ObservedFrame) -> list[SubfieldAnswer]:
@@ -126,13 +128,13 @@ class DividedField:
         estimates = []
         for centre in self.centres():
             places = frame.positions - centre
-            inside = np.sum(places**2, axis=1) <= self._radius**2
+            inside = np.sum(square(places), axis=1) <= square(self._radius)
             if not inside.any():
                 continue
             features = extract_features(frame.brightness[inside], places[inside])
             estimate = self._lsi.solve(features).mse
             roll = math.remainder(features.theta_rad - estimate.theta_rad, 2.0 * math.pi)
-            c, s = math.cos(roll), math.sin(roll)
+            c, s = cos(roll), sin(roll)
             east, north = c * centre[0] + s * centre[1], c * centre[1] - s * centre[0]
             estimates.append(
                 SubfieldAnswer(

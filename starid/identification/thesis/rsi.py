@@ -10,6 +10,7 @@ from typing import Final, Literal
 import numpy as np
 
 from starid.arrays import Array, Mask
+from starid.elementary import square
 from starid.errors import StaridError
 from starid.identification.thesis.cme import CameraMotion, MotionModel, matched_motion
 from starid.identification.thesis.false_stars import FalseStarFilter, ObservedFrame
@@ -128,7 +129,7 @@ def region_side(mean_distance_deg: float, sigma_distance_deg: float, settings: R
 
 def region_cells(side_deg: float, fov_deg: float, overlap: float) -> float:
     """Number of cells of a region, N_RoS = Γ²/(φ_x·φ_y·(1 − p)²), eq. 6.6."""
-    return (side_deg / (fov_deg * (1.0 - overlap))) ** 2
+    return square(side_deg / (fov_deg * (1.0 - overlap)))
 
 
 def correlation(first: Array, second: Array) -> tuple[float, float]:
@@ -283,7 +284,7 @@ class RecursiveIdentification:
         return (everything, None) if motion is None else (result.true_now, motion)
 
     def _features(self, frame: ObservedFrame, chosen: Mask) -> FeatureVector | None:
-        inside = chosen & (np.sum(frame.positions**2, axis=1) <= self._radius**2)
+        inside = chosen & (np.sum(square(frame.positions), axis=1) <= square(self._radius))
         if not inside.any():
             return None
         return extract_features(frame.brightness[inside], frame.positions[inside])

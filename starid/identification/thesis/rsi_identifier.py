@@ -16,11 +16,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array, Mask
+from starid.arrays import Array, Mask, elementwise
 from starid.attitude import Attitude
-from starid.attitude.wahba import solve_wahba
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
+from starid.elementary import atan2, hypot, log10, power
 from starid.identification.options import RsiOptions
 from starid.identification.single_camera import CheckedDetections, SingleCameraIdentifier
 from starid.identification.solution import FeatureReport, Solution
@@ -32,8 +32,10 @@ from starid.identification.thesis.lsi_identifier import (
     LsiIdentifier,
     report_of,
 )
+from starid.identification.thesis.parts import Parts
 from starid.identification.thesis.rsi import RsiSettings, region_side
-from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings, rays
+from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilterSettings, rays
+from starid.matrices import lengths, product
 
 _MIN_MATCHES: Final = 3
 _ENOUGH_MATCHES: Final = 8
@@ -115,6 +117,8 @@ class RsiIdentifier(SingleCameraIdentifier):
         See `LsiIdentifier`.
     options
         By default `RsiOptions()`.
+    parts
+        The parts of the algorithm; by default those of the thesis.
     **changes
         Fields of `RsiOptions` to change.
     """
@@ -124,10 +128,12 @@ class RsiIdentifier(SingleCameraIdentifier):
         camera: Camera = DEFAULT_CAMERA,
         catalog: StarCatalog | None = None,
         options: RsiOptions | None = None,
+        parts: Parts | None = None,
         **changes: Any,
     ) -> None:
         options = dataclasses.replace(options or RsiOptions(), **changes)
-        self.lsi = LsiIdentifier(camera, catalog, options)
+        self._parts = parts or Parts()
+        self.lsi = LsiIdentifier(camera, catalog, options, self._parts)
         super().__init__(camera, self.lsi.catalog)
         self.options = options
         self._settings = RsiSettings(
@@ -139,7 +145,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         scale = math.degrees(1.0 / camera.focal_px[0])
         half_field = 0.5 * self.lsi.database.parameters.fov_deg
         self._filter = (
-            TrackFilter(
+            self._parts.false_star_filter(
                 TrackFilterSettings(
                     position_sigma_deg=options.position_sigma_px * scale,
                     brightness_sigma=0.3,
@@ -174,9 +180,8 @@ class RsiIdentifier(SingleCameraIdentifier):
         """Forget previous frames, the learned zero point and the statistics."""
         self.lsi.reset()
         self._before = self._last = None
+        self._wrong = 1.0
         self._exceeded = False
-        if self._filter is not None:
-            self._filter.reset()
         self.statistics = RsiStatistics()
 
     def _identify(self, measured: CheckedDetections) -> Solution:
@@ -206,7 +211,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         prior = self.preprocess(measured.xy, measured.flux)
         side = prior.side_deg
         if self._last is not None and prior.rotation is not None:
-            centre = Attitude.from_matrix(prior.rotation @ self._last.matrix)
+            centre = Attitude.from_matrix(product(prior.rotation, self._last.matrix))
         else:
             centre = predicted
             if window_px is not None:
@@ -247,7 +252,7 @@ class RsiIdentifier(SingleCameraIdentifier):
             return self._wrong
         new = min(prior.translation_deg / self.lsi.database.grid.step_deg, 1.0)
         odds = self._wrong / max(1.0 - self._wrong, _LEAST_WRONG)
-        odds *= float(errors.ratio[errors.row(answer.error_psi)]) ** new
+        odds *= power(float(errors.ratio[errors.row(answer.error_psi)]), new)
         return max(float(odds / (1.0 + odds)), _LEAST_WRONG)
 
     def _count(self, solution: Solution, report: FeatureReport) -> None:
@@ -272,7 +277,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         ahead = np.isfinite(directions).all(axis=1) & (directions[:, 2] > 0.0)
         usable = usable[ahead]
         positions = np.degrees(directions[ahead, :2] / directions[ahead, 2:3])
-        frame = ObservedFrame(-2.5 * np.log10(flux[usable]), positions)
+        frame = ObservedFrame(-2.5 * elementwise(log10, flux[usable]), positions)
         before, self._before = self._before, frame
         if before is None:
             return unknown
@@ -289,13 +294,13 @@ class RsiIdentifier(SingleCameraIdentifier):
         if len(pairs) < _MIN_MATCHES:
             return unknown
         then, now = _directions(before.positions[pairs[:, 0]]), _directions(frame.positions[pairs[:, 1]])
-        rotation = solve_wahba(now, then).matrix
-        distance_deg = np.degrees(np.linalg.norm(then @ rotation.T - now, axis=1))
+        rotation = self._parts.motion(then, now)
+        distance_deg = np.degrees(lengths(product(then, rotation.T) - now))
         return Preprocessed(
             true_stars,
             rotation,
-            math.degrees(math.atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])),
-            math.degrees(math.atan2(math.hypot(rotation[0, 2], rotation[1, 2]), rotation[2, 2])),
+            math.degrees(atan2(rotation[1, 0] - rotation[0, 1], rotation[0, 0] + rotation[1, 1])),
+            math.degrees(atan2(hypot(rotation[0, 2], rotation[1, 2]), rotation[2, 2])),
             region_side(float(distance_deg.mean()), float(distance_deg.std(ddof=1)), self._settings),
         )
 
@@ -315,7 +320,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         if seen is None:
             return field, ()
         observations = search.doubtful_features(field) if self.options.refinement else [seen]
-        found = [search.answer_in_region(features, centre, side_deg) for features in observations]
+        found = [self._parts.region(search, features, centre, side_deg) for features in observations]
         answers = [answer for answer in found if answer is not None]
         return field, (*answers[:1], *sorted(answers[1:], key=lambda answer: answer.error_psi))
 
@@ -350,4 +355,4 @@ class RsiIdentifier(SingleCameraIdentifier):
 def _directions(positions_deg: Array) -> Array:
     """Unit vectors (n, 3) of gnomonic positions in degrees."""
     found = rays(positions_deg)
-    return np.asarray(found / np.linalg.norm(found, axis=1)[:, None], dtype=np.float64)
+    return np.asarray(found / lengths(found)[:, None], dtype=np.float64)

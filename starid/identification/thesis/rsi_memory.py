@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starid.arrays import Array
+from starid.elementary import cos, sin, square
 from starid.identification.thesis.cme import CameraMotion
 
 _RA, _DEC, _ROLL, _TURN, _X, _Y = range(6)
@@ -79,11 +80,11 @@ class AnswerMemory:
         apart = np.abs(_wrapped(rolls[:, None] - rolls[None, :]))
         middle = rolls[int(np.argmin(apart.sum(axis=1)))]
         roll = middle + float(np.median(_wrapped(rolls - middle)))
-        c, s = math.cos(math.radians(roll)), math.sin(math.radians(roll))
+        c, s = cos(math.radians(roll)), sin(math.radians(roll))
         x, y = answers[:, _X], answers[:, _Y]
         ra = answers[:, _RA] - (c * x + s * y)
         dec = answers[:, _DEC] - (c * y - s * x)
-        distance = np.hypot(_wrapped(ra[:, None] - ra[None, :]), dec[:, None] - dec[None, :])
+        distance = np.sqrt(square(_wrapped(ra[:, None] - ra[None, :])) + square(dec[:, None] - dec[None, :]))
         agrees = distance <= self._agreement
         votes = agrees.sum(axis=1)
         winner = int(np.flatnonzero(votes == votes.max())[-1])

@@ -18,10 +18,12 @@ import numpy as np
 
 from starid.arrays import Array, Indices, Mask
 from starid.attitude.wahba import solve_wahba
+from starid.elementary import square
 from starid.identification.thesis.cme import rigid_fit
 from starid.identification.thesis.false_stars import FilterError, FilterResult, ObservedFrame
 from starid.identification.thesis.frame_grid import Geometry
 from starid.identification.thesis.frame_motion import MAX_VOTERS, find_motion, nearest_objects
+from starid.matrices import length, lengths, product
 
 MAX_OBJECTS: Final = 2000
 """Largest number of objects in a frame."""
@@ -221,7 +223,7 @@ class TrackFilter:
         tracks = _Tracks(
             number,
             positions.copy(),
-            np.full(n, self.settings.position_sigma_deg**2),
+            np.full(n, square(self.settings.position_sigma_deg)),
             brightness.copy(),
             np.ones(n, dtype=np.int64),
             np.zeros(n, dtype=np.int64),
@@ -269,7 +271,7 @@ class TrackFilter:
         error = np.zeros(len(tracks))
         for turn in range(_REFITS):
             predicted = self._motions.moved(tracks.position, motion)
-            variance = tracks.variance + settings.position_sigma_deg**2
+            variance = tracks.variance + square(settings.position_sigma_deg)
             nearest_objects(
                 positions,
                 brightness,
@@ -277,7 +279,7 @@ class TrackFilter:
                 tracks.brightness,
                 variance + error,
                 settings.brightness_sigma,
-                settings.gate**2,
+                square(settings.gate),
                 partner,
             )
             is_paired = partner >= 0
@@ -285,20 +287,20 @@ class TrackFilter:
                 is_paired &= trusted
             objects = positions[np.maximum(partner, 0)]
             if turn > 0 and is_paired.any():
-                distance = np.hypot(*(objects - predicted).T) / np.sqrt(variance)
+                distance = lengths(objects - predicted) / np.sqrt(variance)
                 near = is_paired & (distance <= _TRIM * max(float(np.median(distance[is_paired])), 1.0))
                 is_paired = near if np.count_nonzero(near) > _MIN_OBJECTS else is_paired
             fitted = self._motions.fit(tracks.position, objects, is_paired)
             if fitted is not None:
                 motion = fitted
-                arm = np.sum((tracks.position - tracks.position[is_paired].mean(axis=0)) ** 2, axis=1)
+                arm = np.sum(square(tracks.position - tracks.position[is_paired].mean(axis=0)), axis=1)
                 share = 1.0 / np.count_nonzero(is_paired) + arm / max(float(arm[is_paired].sum()), 1e-12)
-                error = settings.position_sigma_deg**2 * np.minimum(share, 1.0)
+                error = square(settings.position_sigma_deg) * np.minimum(share, 1.0)
         return partner, motion
 
     def _update_tracks(self, positions: Array, brightness: Array, partner: Indices, motion: Array) -> None:
         """Move all tracks with the stars and update the matched ones."""
-        old, sigma2 = self._tracks, self.settings.position_sigma_deg**2
+        old, sigma2 = self._tracks, square(self.settings.position_sigma_deg)
         which = np.flatnonzero(partner >= 0)
         objects = partner[which]
         position = self._motions.moved(old.position, motion)
@@ -329,11 +331,11 @@ class TrackFilter:
         n, t, tt, x, y, z, xx, tx, ty, tz, u, v, uu = tracks.sums[old].T
         as_star = np.maximum(xx - (x * x + y * y + z * z) / n, 0.0)
         as_fixed = np.maximum(uu - (u * u + v * v) / n, 0.0)
-        usual = max(self.settings.position_sigma_deg**2, float(np.median(as_star / (2.0 * n))))
+        usual = max(square(self.settings.position_sigma_deg), float(np.median(as_star / (2.0 * n))))
         spread = np.maximum(tt - t * t / n, _MIN_SPREAD)
         velocity = np.column_stack([tx - t * x / n, ty - t * y / n, tz - t * z / n]) / spread[:, None]
         velocity -= np.median(velocity, axis=0)
-        drift = np.sum(velocity**2, axis=1) * spread / usual
+        drift = np.sum(square(velocity), axis=1) * spread / usual
         drift /= max(1.0, float(np.median(drift)))
         limit = self.settings.evidence
         result[old] = ((as_star - as_fixed) / usual > limit) | (drift > 2.0 * limit)
@@ -414,23 +416,25 @@ class _Sphere:
     def of_plane(self, motion: Array) -> Array:
         c, s, x, y = motion
         centre = rays(np.array([[x, y]]))[0]
-        centre /= np.linalg.norm(centre)
+        centre /= length(centre)
         right = np.array([1.0, 0.0, 0.0]) - centre[0] * centre
-        right /= np.linalg.norm(right)
+        right /= length(right)
         tilt = np.column_stack([right, np.cross(centre, right), centre])
-        return np.asarray(tilt @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]), dtype=np.float64)
+        return np.asarray(
+            product(tilt, np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])), dtype=np.float64
+        )
 
     def moved(self, positions: Array, motion: Array) -> Array:
-        turned = rays(positions) @ motion.T
+        turned = product(rays(positions), motion.T)
         return np.degrees(turned[:, :2] / np.maximum(turned[:, 2:], _LEAST_DEPTH))
 
     def moved_back(self, positions: Array, motion: Array) -> Array:
         directions = rays(positions)
-        directions /= np.linalg.norm(directions, axis=1)[:, None]
-        return np.degrees(directions @ motion)
+        directions /= lengths(directions)[:, None]
+        return np.degrees(product(directions, motion))
 
     def composed(self, second: Array, first: Array) -> Array:
-        return np.asarray(second @ first, dtype=np.float64)
+        return np.asarray(product(second, first), dtype=np.float64)
 
     def fit(self, before: Array, now: Array, chosen: Mask) -> Array | None:
         if np.count_nonzero(chosen) < _MIN_OBJECTS:

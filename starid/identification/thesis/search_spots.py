@@ -9,7 +9,8 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arrays import Array, Indices, elementwise
+from starid.elementary import cos
 from starid.identification.thesis.frame_grid import GridArrays, cell_centre
 from starid.kernels.jit import compiled, inner_checked
 
@@ -38,7 +39,7 @@ class Spots(NamedTuple):
         bands = int(np.ceil(180.0 / side_deg))
         height_deg = 180.0 / bands
         middle = np.radians((np.arange(bands) + 0.5) * height_deg - 90.0)
-        columns = np.maximum(np.rint(360.0 * np.cos(middle) / side_deg), 1.0).astype(np.int64)
+        columns = np.maximum(np.rint(360.0 * elementwise(cos, middle) / side_deg), 1.0).astype(np.int64)
         return cls(height_deg, np.concatenate([[0], np.cumsum(columns)]))
 
     def none_tried(self) -> Indices:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starid.arrays import Array, Indices
+from starid.elementary import cos, hypot, sin, square
 from starid.identification.thesis.cell_search import CellArrays, CellIndex, exact_nearest, stored_neighbours
 from starid.identification.thesis.database import DatabaseError
 from starid.identification.thesis.features import FeatureVector
@@ -76,7 +77,7 @@ def newton_from(
             place[1] = d
         widen = 1.0
         if arrays.sky.frame[0] > 0.5:
-            widen = 1.0 / max(math.cos(math.radians(d)), 1e-3)
+            widen = 1.0 / max(cos(math.radians(d)), 1e-3)
         _residual(arrays, observation, a + _DIFFERENCE_DEG * widen, d, sums, east)
         east_stars = sums[0]
         _residual(arrays, observation, a, d + _DIFFERENCE_DEG, sums, north)
@@ -100,14 +101,14 @@ def newton_from(
             break
         step_a = -(h11 * g0 - h01 * g1) / determinant
         step_d = -(h00 * g1 - h01 * g0) / determinant
-        length = math.hypot(step_a, step_d)
+        length = hypot(step_a, step_d)
         if length > 0.5 * reach_deg:
             step_a *= 0.5 * reach_deg / length
             step_d *= 0.5 * reach_deg / length
         a += step_a * widen
         d += step_d
         d = min(max(d, -90.0), 90.0)
-        if math.hypot((a - ra) / widen, d - dec) > reach_deg:
+        if hypot((a - ra) / widen, d - dec) > reach_deg:
             break
         if length < _CONVERGED_DEG:
             cost = _residual(arrays, observation, a, d, sums, here)
@@ -138,14 +139,14 @@ def share_seen(
     sums = np.empty(8)
     vector = np.empty(5)
     turn = theta - cell_features(arrays.sky, ra % 360.0, dec, sums, vector)
-    c, s = math.cos(turn), math.sin(turn)
-    limit = (_NEAR_SHARE * arrays.sky.frame[HALF_WIDTH]) ** 2
+    c, s = cos(turn), sin(turn)
+    limit = square(_NEAR_SHARE * arrays.sky.frame[HALF_WIDTH])
     matched = 0
     for i in range(positions.shape[0]):
         x = c * positions[i, 0] + s * positions[i, 1]
         y = c * positions[i, 1] - s * positions[i, 0]
         for j in range(count):
-            if (stars[j, 0] - x) ** 2 + (stars[j, 1] - y) ** 2 <= limit:
+            if square(stars[j, 0] - x) + square(stars[j, 1] - y) <= limit:
                 matched += 1
                 break
     return float(matched / positions.shape[0])
@@ -189,11 +190,11 @@ def subcell_kernel(
         if cell < 0:
             continue
         ra, dec = cell_centre(arrays.grid, cell)
-        narrow = math.cos(math.radians(dec)) if arrays.sky.frame[0] > 0.5 else 1.0
+        narrow = cos(math.radians(dec)) if arrays.sky.frame[0] > 0.5 else 1.0
         is_repeated = False
         for i in range(starts):
             gap = (ra - places[i, 0] + 180.0) % 360.0 - 180.0
-            if math.hypot(gap * narrow, dec - places[i, 1]) < 0.4 * reach_deg:
+            if hypot(gap * narrow, dec - places[i, 1]) < 0.4 * reach_deg:
                 is_repeated = True
                 break
         if is_repeated:

@@ -14,6 +14,8 @@ from starhil.emulator.cli.app import main
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.model import SensorModel
 
+pytestmark = pytest.mark.long
+
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr("sys.argv", ["starhil", "bench", *arguments])

@@ -30,6 +30,8 @@ from starid.errors import StaridError
 from tests.emulator.cli.command_line import run_command_line
 from tests.waiting import wait_until
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("joblib")]
+
 PLAN = CampaignPlan(frames=5, seed=11, chunk=2)
 EXACT = [name for name in RECORD.names or () if not name.endswith("_ms")]
 

@@ -15,6 +15,8 @@ from starhil.emulator.benchmarks.ecss_requirements import read_requirements
 from starhil.emulator.cli.app import build_app
 from starhil.emulator.errors import EmulatorError
 
+pytestmark = pytest.mark.long
+
 SMALL = ["camera.width=320", "camera.height=320", "camera.fov_deg=30.0"]
 DRIFT = ["sensor.boresight_drift_x=2.0", "sensor.boresight_drift_z=6.0", "thermal.swing_c=10.0"]
 OPTIONS = ["--fields", "12", "--rest-frames", "20", "--frames", "5", "--seed", "4", "--json"]

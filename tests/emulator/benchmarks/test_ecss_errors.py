@@ -15,6 +15,8 @@ from starhil.emulator.benchmarks.ecss_errors import (
 )
 from starhil.emulator.errors import EmulatorError
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("scipy")]
+
 FIELDS, POSITIONS, REPEATS, DATES, POINTS = 600, 4, 4, 6, 12
 CONFIDENCE = 0.997
 SIZE = np.array([4.0, 7.0, 12.0])

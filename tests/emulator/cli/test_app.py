@@ -16,6 +16,8 @@ from starhil.emulator.cli.run import DeviceOptions
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.workers import NEVER_READY
 
+pytestmark = pytest.mark.lowest("typer")
+
 
 @pytest.mark.parametrize(
     ("error", "said"),
@@ -173,6 +175,16 @@ def test_help_shows_flags_without_a_type_and_positional_arguments_in_capitals() 
         text = CliRunner().invoke(app.build_app(), [command, "--help"]).stdout
         assert "<bool>" not in text
         assert shown in text.split("Usage:")[1].splitlines()[0]
+
+
+def test_the_help_of_run_begins_with_what_most_runs_need(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    text = CliRunner().invoke(app.build_app(), ["run", "--help"]).stdout
+    first, *others = text.partition("─ Options ─")[2].split("╭─")
+    common = "unit serial can symlink orbit set truth-log scenario view record list help"
+    assert re.findall(r"--([\w-]+) ", first) == common.split()
+    assert len(others) == 3
+    assert "written, for example because the disk is full; the run goes on without it." in text
 
 
 def test_the_unit_of_the_command_line_replaces_that_of_the_profile():

@@ -7,6 +7,8 @@ import pytest
 from starhil.protocol.files.bundled import bundled
 from tests.emulator.cli.command_line import run_command_line
 
+pytestmark = pytest.mark.lowest("typer")
+
 
 def completed(monkeypatch: pytest.MonkeyPatch, shell: str, line: str) -> str:
     """Return what a shell is answered at the end of a line."""

@@ -10,6 +10,8 @@ from typer.testing import CliRunner
 
 from starhil.emulator.cli.option_groups import with_option_groups
 
+pytestmark = pytest.mark.lowest("typer")
+
 
 @dataclass(frozen=True)
 class Lens:

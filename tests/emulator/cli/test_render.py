@@ -15,6 +15,8 @@ from starid.camera import DEFAULT_CAMERA
 from starid.imaging.detection import detect
 from starid.imaging.image_io import read_image
 
+pytestmark = pytest.mark.long
+
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr("sys.argv", ["starhil", "render", *arguments])

@@ -141,7 +141,11 @@ def test_in_error_mode_no_attitude_is_shown_and_the_last_image_has_its_age(page)
     )
     stage = page.locator(".stage").evaluate("element => getComputedStyle(element).filter")
     assert stage == "grayscale(1)"
-    page.wait_for_function("() => starhil.charts.to > starhil.store.now + 1")  # the plots go on
+    page.wait_for_function("() => starhil.charts.to > starhil.store.now + 1")
+    labels = page.evaluate(
+        "(() => { const [time] = starhil.charts.plots.at(-1).u.axes; return time.values(null, time.splits()); })()"
+    )
+    assert labels == ["−60 s", "−50 s", "−40 s", "−30 s", "−20 s", "−10 s", "0"]
     assert send(page, "set_mode", mode="standby").startswith("accepted in ")
 
 
@@ -236,6 +240,33 @@ def test_the_page_can_be_paused_scrubbed_and_set_live_again_by_keys(page):
     page.keyboard.press("Space")
     page.wait_for_function(f"() => {frame} > {before}")
     assert not page.locator("body.paused").count()
+
+
+def test_stars_pan_and_time_by_keys_wherever_the_focus_is_in_their_part(page):
+    track(page)
+    page.focus("#sky [data-layer=matched]")
+    page.keyboard.press("n")
+    first = page.locator("#hover").text_content()
+    painted = page.evaluate("starhil.sky.painted")
+    page.wait_for_function("painted => starhil.sky.painted >= painted + 3", arg=painted)
+    assert page.locator("#hover").is_visible()  # the next images leave it chosen
+    assert page.locator("#hover").text_content().splitlines()[0] == first.splitlines()[0]
+    left = page.evaluate("starhil.sky.pointer[0]")
+    page.keyboard.press("n")
+    assert page.evaluate("starhil.sky.pointer[0]") > left
+    page.keyboard.press("+")
+    across, down = page.evaluate("starhil.sky.offset")
+    page.keyboard.press("Shift+ArrowRight")
+    page.keyboard.press("Shift+ArrowUp")
+    panned = page.evaluate("starhil.sky.offset")
+    assert panned[0] > across
+    assert panned[1] < down
+    page.keyboard.press("0")
+    page.focus("#add-plot")
+    page.keyboard.press("PageUp")
+    page.wait_for_selector("body.paused")
+    page.keyboard.press("End")
+    page.wait_for_selector("body:not(.paused)")
 
 
 def test_the_page_paints_at_once_and_every_tab_opens_in_both_themes(page):

@@ -2,7 +2,11 @@
 
 import math
 
+import pytest
+
 from starhil.emulator.console.history import COLUMNS, History
+
+pytestmark = pytest.mark.long
 
 
 def test_eight_hours_of_frames_keep_the_newest_hour_in_the_same_memory(bench):

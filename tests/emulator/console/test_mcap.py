@@ -17,6 +17,8 @@ from tests.emulator.conftest import ORION, PREVIEW
 from tests.emulator.console.pages import OPTIONS, Page
 from tests.emulator.runs import Control, command, every_row_read
 
+pytestmark = pytest.mark.long
+
 ICD = load_unit()
 JSON_TYPES = {"object": dict, "string": str, "number": (int, float), "integer": int, "boolean": bool}
 
@@ -181,6 +183,28 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(run, tmp_path, caplog):
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(said) == 1
     assert "run.mcap: cannot be written (No space left on device); it ends here" in said[0]
+
+
+def test_what_happens_after_the_end_of_the_recording_is_no_error(run, tmp_path, caplog, monkeypatch):
+    """Each end of a run that took images logged an internal error."""
+
+    async def scenario(emulation, _line):
+        await record(emulation)
+        close, published = emulation.run.close, emulation.device.cycle.published
+
+        async def close_later():
+            await emulation.stepper.step(1.0)
+            command(emulation, "set_mode", mode="standby")
+            emulation.faults.clear()
+            assert emulation.device.cycle.published > published
+            await close()
+
+        monkeypatch.setattr(emulation.run, "close", close_later)
+
+    path = tmp_path / "run.mcap"
+    run(scenario, options=options(path))
+    assert messages(path)["/measurement"]
+    assert caplog.text == ""
 
 
 def test_each_head_has_its_own_file(run, tmp_path):

@@ -15,6 +15,8 @@ from tests.candump import parse_candump
 from tests.emulator.console.pages import OPTIONS, Page
 from tests.waiting import PATIENCE_S
 
+pytestmark = pytest.mark.long
+
 LINKS_OFF = {"serial": {"port": "off"}, "can": {"channel": "off"}}
 
 

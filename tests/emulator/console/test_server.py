@@ -5,6 +5,8 @@ import json
 import select
 import socket
 import struct
+import threading
+import time
 from contextlib import AsyncExitStack
 from dataclasses import replace
 
@@ -16,14 +18,19 @@ from starhil.emulator.console import server
 from starhil.emulator.console.console import Console
 from starhil.emulator.console.history import COLUMNS, MODES, History, Image
 from starhil.emulator.console.reported_runs import ReportedRuns
+from starhil.emulator.console.trace import WireTrace
 from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.traffic import Decoder, WireItem
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.rig.console_feed import RunFeed
+from starhil.protocol.can.frame import CanFrame
 from tests.emulator.conftest import PREVIEW
 from tests.emulator.console.pages import ALONG_X, OPTIONS, Page, column
 from tests.emulator.runs import command, read
 from tests.waiting import until
+
+pytestmark = [pytest.mark.long, pytest.mark.lowest("aiohttp")]
 
 
 @pytest.mark.parametrize(
@@ -528,6 +535,23 @@ def test_the_requests_of_a_page_come_at_most_so_often(run, monkeypatch):
     assert min(np.diff(times)) >= server.PAGE_TURN_S
 
 
+@pytest.mark.parametrize("kind", ["ping", "pong"])
+def test_pings_and_pongs_of_a_page_have_their_turns_like_requests(run, kind):
+    """Two pages that only sent pings held up replies on the bus by more than a second."""
+    count = 30
+
+    async def scenario(emulation, _line):
+        async with Page(emulation, field="view_only") as page:
+            begin_s = asyncio.get_running_loop().time()
+            for _ in range(count):
+                await getattr(page.socket, kind)(b"")
+            await page.ask(do="parameters")
+            return asyncio.get_running_loop().time() - begin_s
+
+    options = replace(OPTIONS, console=replace(OPTIONS.console, view_token="look"))
+    assert run(scenario, options=options) >= count * server.PAGE_TURN_S
+
+
 def test_a_page_that_comes_back_gets_the_rows_that_it_lacks_and_no_others(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
@@ -630,6 +654,40 @@ def test_a_message_of_the_trace_is_returned_with_its_fields_and_what_sends_it(ru
             assert "set_mode mode=lost_in_space" in text
 
     run(scenario, options=OPTIONS)
+
+
+def test_exports_are_made_one_at_a_time_beside_the_loop_while_traffic_passes(run, monkeypatch):
+    """The trace as text failed when an item passed meanwhile, and a log of 20 000 frames took the loop 60 ms."""
+    making, threads = set(), []
+
+    async def scenario(emulation, _line):
+        item = WireItem(0.0, "can", outgoing=False, item=CanFrame(0x04800104))
+        emulation.traffic.passed.emit(item)
+
+        def observed(method):
+            def make(self, *arguments):
+                making.add(method)
+                threads.append((threading.current_thread(), len(making)))
+                emulation.traffic.passed.emit(item)
+                time.sleep(0.05)
+                emulation.traffic.passed.emit(item)
+                try:
+                    return method(self, *arguments)
+                finally:
+                    making.discard(method)
+
+            return make
+
+        monkeypatch.setattr(Decoder, "line", observed(Decoder.line))
+        monkeypatch.setattr(WireTrace, "candump", observed(WireTrace.candump))
+        async with Page(emulation) as page:
+            log, text = await asyncio.gather(page.get("/wire.log"), page.get("/wire.txt"))
+        assert "04800104#" in log
+        assert "identification?" in text
+
+    run(scenario, options=OPTIONS)
+    assert threading.main_thread() not in {thread for thread, _ in threads}
+    assert {count for _, count in threads} == {1}
 
 
 def test_text_is_compressed(run):

@@ -9,6 +9,8 @@ import pytest
 from tests.emulator.console.pages import OPTIONS, Page
 from tests.emulator.runs import Control
 
+pytestmark = pytest.mark.long
+
 VALUES = (
     None, True, 0, -1, 2**70, 1e308, "", "x", "\ud800", [], [None], [1, "x", {}],
     [[1]], [1e308] * 3, [10**400] * 3, [True] * 3, {}, {"x": 1}, {"star": []}, {"star": "HIP " + "9" * 5000},

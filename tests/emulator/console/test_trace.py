@@ -16,6 +16,8 @@ from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
 from tests.protocol.serial.composed_links import CUBESPACE
 
+pytestmark = pytest.mark.long
+
 ICD = load_unit()
 MODE = ICD.telecommands["set_mode"]
 STATUS = ICD.telemetry["device_status"]

@@ -56,12 +56,18 @@ def test_euler_angles_at_gimbal_lock_leave_the_third_rotation_out(sequence, end)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_rotation_vector_is_that_of_the_quaternion(sign):
+def test_rotation_gibbs_and_rodrigues_vector_are_those_of_the_quaternion(sign):
     rng = np.random.default_rng(2)
     for _ in range(200):
         q = sign * random_attitude(rng).quaternion_xyzw
         vector = Reported("ok", tuple(q.tolist())).rotation_vector_rad
         assert vector == pytest.approx(Rotation.from_quat(q).as_rotvec(), abs=TOLERANCE)
+        assert Reported("ok", tuple(q.tolist())).gibbs_vector == pytest.approx(tuple(q[:3] / q[3]))
+        parameters = Reported("ok", tuple(q.tolist())).modified_rodrigues
+        assert parameters == pytest.approx(Rotation.from_quat(q).as_mrp(), abs=TOLERANCE)
+    assert Reported("ok", (0.0, 0.6, -0.8, sign * 0.0)).gibbs_vector == pytest.approx(
+        (0.0, sign * 6e11, sign * -8e11)
+    )
     assert Reported("ok", (0.0, 0.0, 0.0, sign)).rotation_vector_rad == (0.0, 0.0, 0.0)
 
 
@@ -69,6 +75,7 @@ FORMS = {
     **{f"dcm_{axis}{n}": (f"attitude.dcm_{axis}[{n}]", "") for axis in "xyz" for n in (1, 2, 3)},
     **{f"euler{n}": (f"attitude.euler_zyx[{n}]", "deg") for n in (1, 2, 3)},
     **{f"rotation_{axis}": (f"attitude.rotation_{axis}", "rad") for axis in "xyz"},
+    **{f"{form}_{axis}": (f"attitude.{form}_{axis}", "") for form in ("gibbs", "mrp") for axis in "xyz"},
     "ra": ("attitude.ra", "deg"),
     "dec": ("attitude.dec", "rad"),
     "roll": ("attitude.roll", "deg"),
@@ -123,8 +130,13 @@ def test_a_row_reports_the_attitude_in_every_form(bench_of_forms):
     assert [row[f"dcm_{axis}{n}"] for axis in "xyz" for n in (1, 2, 3)] == pytest.approx(matrix.ravel())
     angles = Rotation.from_matrix(matrix.T).as_euler("ZYX", degrees=True)
     assert [row[f"euler{n}"] for n in (1, 2, 3)] == pytest.approx(angles)
-    vector = Rotation.from_matrix(matrix).inv().as_rotvec()  # the convention "attitude" is the inverse
-    assert [row[f"rotation_{axis}"] for axis in "xyz"] == pytest.approx(vector)
+    turn = Rotation.from_matrix(matrix).inv()  # the convention "attitude" is the inverse
+    assert [row[f"rotation_{axis}"] for axis in "xyz"] == pytest.approx(turn.as_rotvec())
+    assert [row[f"mrp_{axis}"] for axis in "xyz"] == pytest.approx(turn.as_mrp())
+    half_angle = 0.5 * turn.magnitude()
+    assert [row[f"gibbs_{axis}"] for axis in "xyz"] == pytest.approx(
+        turn.as_rotvec() / turn.magnitude() * math.tan(half_angle)
+    )
     assert (row["ra"], row["dec"], row["roll"]) == pytest.approx((251.3, math.radians(38.7), 200.0))
 
 

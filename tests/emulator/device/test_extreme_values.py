@@ -21,6 +21,8 @@ from starhil.protocol.unit import load_unit
 from starid.errors import StaridError
 from tests.emulator.conftest import ORION
 
+pytestmark = pytest.mark.long
+
 UNITS = sorted(bundled_units())
 FLOATS = (
     0.0,

@@ -147,7 +147,7 @@ def test_the_pattern_in_time_the_count_and_the_probability(found):
     [
         ({"row": "precise_attitud", "freeze": "all"}, "did you mean precise_attitude?"),
         ({"row": ROW, "set": {"q_xx": 0.5}}, "row precise_attitude has no field 'q_xx'"),
-        ({"set": {"no_such_field": 1}}, "no row of unit cubestar-like has a field 'no_such_field'"),
+        ({"set": {"no_such_field": 1}}, "no row of unit cubestar has a field 'no_such_field'"),
         ({"row": "device_status", "nan": ["mode"]}, "mode is not a float"),
         ({"row": "device_status", "set": {"mode": 300}}, "telemetry.set.mode: "),
         ({"row": "device_status", "conjugate": True}, "device_status has no quaternion"),

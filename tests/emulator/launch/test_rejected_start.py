@@ -8,6 +8,8 @@ from starhil.emulator.launch import ConsoleOptions, RunOptions
 from starhil.protocol.errors import ProtocolError
 from tests.emulator.runs import FakeImager
 
+pytestmark = pytest.mark.long
+
 NO_PORT = {"serial": {"port": "/dev/no-such-port"}, "can": {"channel": "off"}}
 
 

@@ -10,6 +10,7 @@ import os
 import platform
 import re
 import shutil
+import socket
 
 import pytest
 
@@ -28,6 +29,8 @@ from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import CAMERA, Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
 from tests.waiting import PATIENCE_S, until
+
+pytestmark = pytest.mark.long
 
 PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 5.0}
 ROUNDS = 10
@@ -169,9 +172,27 @@ def test_nothing_runs_that_only_a_recording_names(tmp_path, unit_of_others, monk
     monkeypatch.chdir(tmp_path)
     assert run_command_line("replay", str(folder))[0] == 2
     assert not mark.exists()
+    assert run_command_line("replay", str(folder), "--set", "device.boot_s=1")[0] == 2
+    assert not mark.exists()
     status, _, err = run_command_line("replay", str(folder), "--unit", "others/unit")
     assert mark.exists()
     assert f"{folder / EVENTS_FILE}: cannot be read" in err  # there is no tape
+
+
+@pytest.mark.parametrize("capture", [0, "http://127.0.0.1:{port}/night.avi"])
+def test_no_camera_or_address_is_opened_that_only_a_recording_names(tmp_path, capture):
+    """OpenCV opens addresses, and where it has GStreamer whole pipelines, which may write files."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0.0)
+        named = capture.format(port=server.getsockname()[1]) if isinstance(capture, str) else capture
+        folder = tmp_path / "recorded"
+        prepare_recording(folder, Profile(images={"capture": named}), "")
+        (folder / EVENTS_FILE).write_text('{"do": "end", "ns": 0}\n')
+        status, _, err = run_command_line("replay", str(folder))
+        with pytest.raises(BlockingIOError):
+            server.accept()
+    assert status == 2
+    assert f"took images from {named!r}, which it does not contain; give a profile of your own" in err
 
 
 def test_a_unit_of_toml_alone_is_replayed_from_where_it_was(tmp_path):
@@ -574,6 +595,47 @@ def test_another_profile_is_compared_with_the_recording(record, tmp_path, overri
     status, out, err = run_command_line("replay", str(folder), "--profile", str(mine), "--set", override)
     assert (status, err) == (0 if said == "identical" else 1, "")
     assert said in out
+
+
+def test_a_key_of_the_recorded_profile_is_changed_and_the_fields_that_differ_are_listed(record, tmp_path):
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    folder, table = record(scenario), tmp_path / "new" / "differences.csv"
+    words = ["replay", str(folder), "--set", "device.firmware_minor=9", "--csv", str(table)]
+    status, out, err = run_command_line(*words)
+    assert (status, err) == (1, "")
+    assert "identification, byte 3: recorded 00, now 09" in out
+    (row,) = csv.DictReader(table.read_text().splitlines())
+    messages = int(row["messages"])
+    assert messages >= ROUNDS
+    assert (row["link"], row["row"], row["field"]) == ("serial", "identification", "firmware_minor")
+    assert (row["differ"], row["largest"], row["recorded"], row["now"]) == (str(messages), "9.0", "0", "9")
+    shown = rf"serial +identification +firmware_minor +{messages} of {messages} +9 +{float(row['first_s']):.3f} +0 +9\s"
+    assert re.search(shown, out)
+    status, out, err = run_command_line(*words[:2], "--csv", str(table))
+    assert (status, err, table.read_text().count("\n")) == (0, "", 1)
+
+
+def test_another_truth_shows_in_the_fields_of_the_attitude_alone(record):
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    folder = record(scenario)
+    report = asyncio.run(
+        replay(folder, settings=["truth={kind='fixed', attitude={ra_deg=10.0, dec_deg=0.0}}"])
+    )
+    fields = {(item.row, item.field): item for item in report.fields}
+    assert {row for row, _ in fields} == {"precise_attitude"}
+    assert fields["precise_attitude", "q_x"].largest > 0.1
+    assert fields["precise_attitude", "q_x"].first_s > 0.0
+
+
+@pytest.mark.parametrize("key", ["run.seed", "links.serial.port"])
+def test_what_stays_as_recorded_is_not_set(tmp_path, key):
+    status, _, err = run_command_line("replay", str(tmp_path), "--set", f"{key}=1")
+    assert (status, err.count("\n")) == (2, 1)
+    assert f"--set {key}=1: a replay has `links` and `run`, except the algorithm, as recorded" in err
 
 
 @pytest.mark.parametrize("content", [None, "{}", '{"profile": {"x": 1}, "folder": "."}'])

@@ -10,6 +10,8 @@ import pytest
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from tests.waiting import PATIENCE_S
 
+pytestmark = pytest.mark.long
+
 AHEAD = """
 import sys
 from starhil.emulator.sensor.pipeline import worker_process
@@ -56,6 +58,16 @@ def test_ctrl_c_in_a_terminal_does_not_reach_the_worker():
         assert os.getpgid(worker.process.pid) == worker.process.pid
     finally:
         worker.end()
+
+
+@pytest.mark.process
+def test_a_machine_without_room_for_a_worker_is_an_error_of_one_line():
+    """Before the command line was read, it was a traceback."""
+    program = AHEAD.replace(
+        "raise KeyboardInterrupt", "raise BlockingIOError(11, 'Resource temporarily unavailable')"
+    )
+    ended = python(program.format(arguments=["run", "demo"]))
+    assert (ended.returncode, ended.stderr) == (2, "starhil: Resource temporarily unavailable\n")
 
 
 def test_a_worker_that_was_started_ahead_is_taken_once(monkeypatch):

@@ -12,6 +12,8 @@ from starid.attitude import Attitude
 from tests.emulator.runs import Control, FakeImager
 from tests.waiting import turns
 
+pytestmark = pytest.mark.long
+
 SLOW_START_S = 100.0
 CLOCKS = ("real", "scaled:5", "stepped")
 SLEW = {

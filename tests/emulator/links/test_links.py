@@ -14,15 +14,17 @@ import pytest
 
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.base import MAX_HELD
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialDamage, SerialLink
-from starhil.emulator.links.wire_faults import WireFault, WireFaults
+from starhil.emulator.links.wire_faults import MAX_DELAYED, WireFault, WireFaults
 from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.simulation.scheduler import Scheduler
 from starhil.protocol.can.cubespace import CanHostReceiver, CanId, MessageType, encode_request_frames
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial.cubespace import Dialect
+from starhil.protocol.transports.python_can import QUEUE_LIMIT
 from starhil.protocol.transports.serial import open_serial
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
@@ -122,6 +124,27 @@ def test_replies_keep_the_order_of_the_requests_while_a_save_is_pending(bench):
         waiting.pop()(None)
         assert [len(body) for body in bodies_in(b"".join(linked.uart.take()))] == [1]
         assert len(linked.over_serial(128)) == 1
+
+    in_loop(scenario())
+
+
+def test_while_a_save_is_pending_requests_beyond_a_limit_are_lost_and_flagged_as_an_overrun(bench):
+    """A million requests of 6 bytes were kept, and then answered at once."""
+
+    async def scenario():
+        linked = await Linked(bench).start()
+        waiting = []
+        bench.device._background = lambda _work, done: waiting.append(done)
+        linked.over_serial(bench.icd.telecommands["save_parameters"].id)
+        request = CUBESPACE.encode_request(Request.of(128))
+        linked.uart.arrive(request * MAX_HELD)
+        assert "telecommand_overrun" not in bench.device.counters.flags
+        linked.uart.arrive(request * 3)
+        assert "telecommand_overrun" in bench.device.counters.flags
+        waiting.pop()(None)
+        assert len(linked.uart.take()) == 1 + MAX_HELD
+        linked.uart.arrive(request * 2 * MAX_HELD)
+        assert len(linked.uart.take()) == 2 * MAX_HELD
 
     in_loop(scenario())
 
@@ -462,6 +485,34 @@ def test_pieces_of_one_reply_are_not_mixed_with_those_of_the_next():
     ]  # fmt: skip
     wire.send(b"l")
     assert sent[-1] == (2.0, b"l")
+
+
+def test_of_what_a_delay_holds_back_the_oldest_is_kept_up_to_a_limit():
+    clock, scheduler, sent = SteppedClock(), Scheduler(), []
+    wire = WireFaults(sent.append, SerialDamage(), clock, scheduler, 1)
+    wire.settings = WireFault(delay_s=60.0)
+    for number in range(MAX_DELAYED + 5):
+        wire.send(number.to_bytes(4, "big"))
+    while (event := scheduler.pop_due(10**11)) is not None:
+        clock.set_ns(event.due_ns)
+        event.action(event.due_ns)
+    assert sent == [number.to_bytes(4, "big") for number in range(MAX_DELAYED)]
+
+
+def test_frames_beyond_a_limit_do_not_wait_for_the_gap_between_frames(bench):
+    async def scenario():
+        bus = Wire()
+        link = CanLink(bench.requests, bus, frame_gap_s=0.5)
+        await link.start()
+        frames = encode_request_frames(Request.of(128), 1, 4)
+        for _ in range(QUEUE_LIMIT + 50):
+            for frame in frames:
+                bus.arrive(frame)
+        assert len(link._waiting) == QUEUE_LIMIT
+        assert bus.statistics.dropped > 0
+        await link.close()
+
+    in_loop(scenario())
 
 
 def test_can_faults_lose_frames_and_the_host_notices(bench):

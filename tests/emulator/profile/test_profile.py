@@ -19,6 +19,8 @@ from starhil.protocol.files.bundled import bundled
 from starid.camera import Camera
 from starid.catalog import load_catalog
 
+pytestmark = pytest.mark.lowest("pydantic")
+
 
 def write(tmp_path, text, name="mine.toml"):
     path = tmp_path / name

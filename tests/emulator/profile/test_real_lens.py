@@ -17,6 +17,8 @@ from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starhil.protocol.unit import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 
+pytestmark = pytest.mark.long
+
 DATA_SHEET_ARCSEC = 55.44 * 2**0.5
 """About x and y together."""
 FIELDS = 4

@@ -19,6 +19,8 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.imaging.detection import detect
 
+pytestmark = pytest.mark.lowest("numba")
+
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 CLEAN = SensorModel(bits=16, hot_pixels=0, dead_pixels=0, prnu=0.0, dsnu=0.0, read_noise_e=2.0)
 BETA1_CAPRICORNI, BETA2_CAPRICORNI = 100345, 100325

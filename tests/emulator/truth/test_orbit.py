@@ -23,6 +23,8 @@ from starhil.emulator.truth.source import FixedTruth, TruthState
 from starid.attitude import Attitude
 from starid.catalog.earth import unix_time
 
+pytestmark = pytest.mark.lowest("sgp4")
+
 NEW_YEAR = 1_767_225_600.0
 VANGUARD = (  # Vallado et al. 2006, AIAA 2006-6753, satellite 5
     "1 00005U 58002B   00179.78495062  .00000023  00000-0  28098-4 0  4753",

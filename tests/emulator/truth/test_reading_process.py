@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -189,6 +190,31 @@ def is_alive(process: int) -> bool:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def test_a_file_that_has_nothing_yet_is_rejected_without_waiting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The truth could not be set again as long as nobody wrote to such a file, which in /proc counts as a regular one."""
+    path = tmp_path / "kmsg"
+    os.mkfifo(path)
+    monkeypatch.setattr(stat, "S_ISREG", lambda _mode: True)
+    writer = os.open(path, os.O_RDWR)
+    try:
+        with pytest.raises(EmulatorError, match="Resource temporarily unavailable"):
+            read_truth(path)
+    finally:
+        os.close(writer)
+
+
+@pytest.mark.process
+def test_what_waits_too_long_for_a_file_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading_process, "LONGEST_S", 1)
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    path = write(tmp_path / "meta", f"KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '{pipe}' )\n")
+    with pytest.raises(EmulatorError, match=r"cannot be read .it takes longer than 1 s."):
+        read_truth(path)
 
 
 @pytest.mark.process

@@ -24,6 +24,8 @@ from starhil.protocol.unit import load_unit
 from tests.hil_tests.fake_device import EDGE, FakeDevice, bmp_file
 from tests.waiting import PATIENCE_S, wait_until
 
+pytestmark = pytest.mark.long
+
 TIMEOUT_S = 0.15
 LINKS = ["serial-a", "serial-b", "serial-c", "can"]
 

@@ -11,6 +11,8 @@ from starhil.hil_tests.endurance.life import Life, make_life
 from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.unit import load_unit
 
+pytestmark = pytest.mark.long
+
 WAIT = {"do": "wait", "s": 20.0}
 
 

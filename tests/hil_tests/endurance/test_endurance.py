@@ -38,6 +38,8 @@ from starhil.protocol.icd.codec import Row
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
 
+pytestmark = pytest.mark.long
+
 LIVES, STEPS = 2, 150
 """Of each unit; `make years` has many more."""
 ROOT = Path(__file__).parents[3]
@@ -356,7 +358,16 @@ def test_a_store_that_loses_what_it_stores_is_found(monkeypatch):
     assert "boot_count" in violating("cubestar", 2)[1]
 
 
-@pytest.mark.parametrize("text", ['{"unit": "cubestar"}', "[]", "[" * 5000], ids=["keys", "list", "deep"])
+NO_LIVES = {
+    "keys": '{"unit": "cubestar"}',
+    "list": "[]",
+    "deep": "[" * 5000,
+    "profile": '{"unit": "cubestar", "seed": 1, "links": ["serial"], "steps": [], "profile": "ideal"}',
+    "camera": '{"unit": "cubestar", "seed": 1, "links": ["serial"], "steps": [], "rendered": true, "profile": {"images": {"capture": 0}}}',
+}
+
+
+@pytest.mark.parametrize("text", NO_LIVES.values(), ids=NO_LIVES)
 def test_a_file_that_is_no_life_is_rejected(tmp_path, text):
     path = tmp_path / "life.json"
     path.write_text(text)

@@ -20,6 +20,8 @@ from starhil.hil_tests.judge.definition import read_unit
 from starhil.hil_tests.judge.rows import PARAMETER
 from starhil.protocol.can.frame import CanFrame
 
+pytestmark = pytest.mark.long
+
 UNIT = read_unit("cubestar")
 IDENTIFICATION, VERSION = UNIT.telemetry["identification"], UNIT.telemetry["boot_status"]
 SIGMA_ARCSEC = (5.0, 25.0)

@@ -24,6 +24,8 @@ from starhil.protocol.messages import ReplyKind, Request, RequestKind
 from starhil.protocol.unit import load_unit
 from tests.waiting import PATIENCE_S
 
+pytestmark = pytest.mark.long
+
 ICD = load_unit()
 READY = "print('Hello', flush=True); print('ready unit=sagitta serial=/dev/x', flush=True)"
 FOREVER = "import time; time.sleep(600)"

@@ -16,6 +16,8 @@ from starhil.hil_tests.rig import control
 from starhil.hil_tests.rig.control import ControlClient, Truth
 from starhil.protocol.icd.conventions import Conventions
 
+pytestmark = pytest.mark.long
+
 Answer = Callable[[dict], dict | None]
 
 

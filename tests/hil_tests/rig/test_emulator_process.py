@@ -8,6 +8,8 @@ from starhil.hil_tests.errors import EmulatorProcessError
 from starhil.hil_tests.rig import emulator_process
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess
 
+pytestmark = pytest.mark.long
+
 WITHIN_S = 2.0
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
 
+pytestmark = pytest.mark.long
+
 OWNER = """
 import sys, time
 from pathlib import Path

@@ -5,20 +5,20 @@ from __future__ import annotations
 import pytest
 from pydantic import TypeAdapter
 
-from starhil.hil_tests.attitude import as_reported, from_radec_roll
+from starhil.hil_tests.attitude import as_reported, attitude_in, from_radec_roll
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.session.expect import (
     AttitudeCheck,
     Conditions,
     ReadConditions,
     Variable,
-    measured_attitude,
     show,
 )
 from starhil.protocol.icd.conventions import Conventions
 from starhil.protocol.unit import load_unit
 
 SENSOR = Conventions()
+ROW = load_unit().telemetry["precise_attitude"]
 
 
 def expectation(value, known=()):
@@ -90,13 +90,13 @@ def test_an_attitude_is_judged_in_arcseconds_and_an_invalid_one_fails():
     truth = from_radec_roll(10.0, 20.0, 30.0)
     off = from_radec_roll(10.0, 20.0 + 10.0 / 3600.0, 30.0)
     values = dict(zip(("q_x", "q_y", "q_z", "q_w"), off, strict=True)) | {"valid": True, "reason": "ok"}
-    error, problem = AttitudeCheck(within_arcsec=10.1).judge(values, truth, SENSOR)
+    error, problem = AttitudeCheck(within_arcsec=10.1).judge(ROW, values, truth, SENSOR)
     assert problem is None
     assert error.cross_boresight_arcsec == pytest.approx(10.0, abs=1e-6)
-    _, problem = AttitudeCheck(within_arcsec=9.9).judge(values, truth, SENSOR)
+    _, problem = AttitudeCheck(within_arcsec=9.9).judge(ROW, values, truth, SENSOR)
     assert problem == "cross-boresight error 10.0 arcsec, expected at most 9.9 arcsec"
     error, problem = AttitudeCheck(within_arcsec=1e9).judge(
-        values | {"valid": False, "reason": "no_match"}, truth, SENSOR
+        ROW, values | {"valid": False, "reason": "no_match"}, truth, SENSOR
     )
     assert error is None
     assert "no_match" in problem
@@ -105,7 +105,7 @@ def test_an_attitude_is_judged_in_arcseconds_and_an_invalid_one_fails():
 def test_a_large_error_is_given_in_degrees_with_both_attitudes():
     truth, measured = from_radec_roll(83.8, -1.2, 30.0), from_radec_roll(133.3438, -1.2, 30.0)
     values = dict(zip(("q_x", "q_y", "q_z", "q_w"), measured, strict=True))
-    _, problem = AttitudeCheck(within_arcsec=60.0).judge(values, truth, SENSOR)
+    _, problem = AttitudeCheck(within_arcsec=60.0).judge(ROW, values, truth, SENSOR)
     assert problem == (
         "cross-boresight error 49.532 deg, expected at most 60 arcsec; measured RA 133.3438, Dec -1.2000, "
         "roll 30.0000 deg, true RA 83.8000, Dec -1.2000, roll 30.0000 deg"
@@ -114,7 +114,7 @@ def test_a_large_error_is_given_in_degrees_with_both_attitudes():
 
 def test_an_all_zero_quaternion_is_not_an_attitude():
     with pytest.raises(BenchError, match="length is 0"):
-        measured_attitude({"q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 0.0})
+        attitude_in(ROW, {"q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 0.0})
 
 
 def test_an_attitude_is_compared_as_the_unit_reports_it():
@@ -123,13 +123,13 @@ def test_an_attitude_is_compared_as_the_unit_reports_it():
     reported = as_reported(truth, conventions)
     values = dict(zip(("q_x", "q_y", "q_z", "q_w"), reported, strict=True)) | {"valid": True}
     check = AttitudeCheck(within_arcsec=0.01, roll_within_arcsec=0.01)
-    assert check.judge(values, truth, conventions)[1] is None
+    assert check.judge(ROW, values, truth, conventions)[1] is None
     for other in (SENSOR, Conventions(quaternion="attitude"), Conventions(axes=["+y", "-x", "+z"])):
-        assert "expected at most" in check.judge(values, truth, other)[1]
+        assert "expected at most" in check.judge(ROW, values, truth, other)[1]
 
 
 def test_an_attitude_that_a_map_calls_invalid_is_not_compared():
     row = load_unit("sagitta").telemetry["solution"]
     values = row.decode(row.encode({"q_w": 1.0, "valid": "false"}, check=False))
     with pytest.raises(BenchError, match="not valid"):
-        measured_attitude(values)
+        attitude_in(row, values)

@@ -24,6 +24,8 @@ from starhil.protocol.transports.serial import open_serial
 from starhil.protocol.unit import load_unit
 from tests.protocol.serial.composed_links import CUBESPACE
 
+pytestmark = pytest.mark.long
+
 ICD = load_unit()
 RATE = 300.0
 SECONDS = 0.6

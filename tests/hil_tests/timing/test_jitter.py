@@ -25,6 +25,8 @@ from starhil.protocol.transports.hub import CanHub
 from starhil.protocol.unit import load_unit
 from tests.hil_tests.timing.test_can_load import DEVICE, HOST, can_device, good
 
+pytestmark = pytest.mark.long
+
 NODE = 44
 PERIOD_MS = 5
 SECONDS = 0.15

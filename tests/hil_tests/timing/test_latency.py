@@ -18,6 +18,8 @@ from starhil.protocol.messages import ErrorCode
 from starhil.protocol.unit import load_unit
 from tests.hil_tests.fake_device import FakeDevice
 
+pytestmark = pytest.mark.long
+
 ICD = load_unit()
 ROW = ICD.telemetry["quaternion"]
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
-import sys
 from collections import deque
 from collections.abc import Iterable
 from functools import lru_cache
-from pathlib import Path
 
 import canopen
 import pytest
 
-import starhil.protocol.canopen
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.case import CaseFailed
@@ -21,6 +17,7 @@ from starhil.hil_tests.conformance.runner import run_case
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.application import GreyImage
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
+from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import ParameterStorage
 from starhil.protocol.unit import load_unit
@@ -192,9 +189,9 @@ def import_eds(text: str, node_id: int) -> canopen.ObjectDictionary:
         return canopen.import_od(file, node_id)
 
 
-def simulated_probe(package=starhil.protocol.canopen) -> CanopenProbe:
-    """Put the slave of a package (the original, or a mutant) on a simulated bus, with the tester at its other end."""
-    dictionary = package.device_dictionary.DeviceDictionary(load_unit())
+def simulated_probe() -> CanopenProbe:
+    """Put the slave on a simulated bus, with the tester at its other end."""
+    dictionary = DeviceDictionary(load_unit())
 
     class RestlessApplication(StandInApplication):
         """Each look at the attitude finds a new one, so that values of two samples cannot be taken for one."""
@@ -207,9 +204,9 @@ def simulated_probe(package=starhil.protocol.canopen) -> CanopenProbe:
                 self.rows[row.name] = {"frame_counter": self.reads}
             return super().telemetry(row)
 
-    dictionary.application = RestlessApplication(dictionary.icd, package)
-    slave = package.slave.CanopenSlave(dictionary, NODE)
-    eds = package.eds.build_eds(dictionary)
+    dictionary.application = RestlessApplication(dictionary.icd)
+    slave = CanopenSlave(dictionary, NODE)
+    eds = build_eds(dictionary)
     return CanopenProbe(SimulatedBus(slave), NODE, import_eds(eds, NODE), eds)
 
 
@@ -235,17 +232,6 @@ def run_conformance():
         return outcomes
 
     return run
-
-
-@pytest.fixture(scope="session")
-def mutants():
-    """The module with the mutants of the slave."""
-    path = Path(__file__).with_name("mutants.py")
-    spec = importlib.util.spec_from_file_location("canopen_mutants", path)
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture

@@ -1,24 +1,11 @@
-"""Mutants of the CANopen slave: one defect each, as one change in one module.
-
-A mutant is the whole package loaded under another name with that text replaced. The text must occur in the module exactly
-once, so that a mutant cannot silently become the original.
-"""
+"""Mutants of the CANopen slave: one defect each, as one change in one module."""
 
 from __future__ import annotations
 
-import importlib.util
-import re
-import sys
-import types
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import cache
-from pathlib import Path
 
-import starhil.protocol.canopen
-
-PACKAGE = "starhil.protocol.canopen"
-FOLDER = Path(starhil.protocol.canopen.__file__).parent
-ALIAS = "mutant_canopen"
+from tests.planted import Edit, planted
 
 
 @dataclass(frozen=True)
@@ -30,6 +17,10 @@ class Mutant:
     module: str
     old: str
     new: str
+
+    def planted(self) -> AbstractContextManager[None]:
+        """Put the defect into the running slave."""
+        return planted(Edit(f"canopen.{self.module}", self.old, self.new))
 
 
 MUTANTS = (
@@ -119,7 +110,7 @@ MUTANTS = (
     Mutant("TIME moved while it is consumed", "time", "timestamp", "enabled=lambda value: bool(value & CONSUMER_BIT)", "enabled=lambda value: False"),
     Mutant("EMCY without the generic bit", "emcy", "emergency", "= bits | ErrorRegister.GENERIC", "= bits & ~ErrorRegister.GENERIC"),
     Mutant("EMCY repeated", "emcy", "emergency", "        if (code, key) in self._active:\n            return\n", ""),
-    Mutant("EMCY of 7 bytes", "emcy", "emergency", "construct.Padded(5, construct.GreedyBytes)", "construct.Padded(4, construct.GreedyBytes)"),
+    Mutant("EMCY of 7 bytes", "emcy", "emergency", "MESSAGE.build(fields)", "MESSAGE.build(fields)[:7]"),
     Mutant("error register stays", "emcy", "emergency", "if self._active.pop((code, key), None) is None:", "if (code, key) not in self._active:"),
     Mutant("history oldest first", "emcy", "emergency", "self._history.insert(0, code |", "self._history.append(code |"),
     Mutant("history without end", "emcy", "emergency", "        del self._history[self._capacity :]\n", ""),
@@ -171,7 +162,7 @@ MUTANTS = (
     Mutant("LSS reports the pending node-ID", "lss", "lss", "self._send(command, bytes([self._context.node_id]))", "self._send(command, bytes([self.pending_node_id ^ 1]))"),
     Mutant("LSS takes reserved bit rates", "lss", "lss", "BIT_RATES.get(data[2], 0)", "BIT_RATES.get(data[2], 125_000)"),
     Mutant("LSS identify ignores ranges", "lss", "lss", "number <= own if step % 2 == 0 else number >= own", "True"),
-    Mutant("LSS identify answered by another command", "lss", "lss", "    IDENTIFIED = 0x4F\n", "    IDENTIFIED = 0x47 + 1\n"),
+    Mutant("LSS identify answered by another command", "lss", "lss", "matches=matches):\n                self._send(Command.IDENTIFIED)", "matches=matches):\n                self._send(Command.NON_CONFIGURED)"),
     Mutant("configured node answers fastscan", "lss", "lss", "if not self._unconfigured or self.configuring:", "if self.configuring:"),
     Mutant("fastscan compares wrong bits", "lss", "lss", "if number >> bit != self._identity(part) >> bit:", "if number >> bit + 1 != self._identity(part) >> bit + 1:"),
     Mutant("fastscan does not end in configuration", "lss", "lss", "self.configuring = following < part", "self.configuring = False"),
@@ -182,65 +173,3 @@ MUTANTS = (
     Mutant("EDS with high limits too low", "eds", "eds", "key: str(int(limit))", "key: str(int(limit) // 1000)"),
     Mutant("EDS calls everything mappable", "tpdo", "eds", '{"PDOMapping": str(int(item.pdo_mappable))}', '{"PDOMapping": "1"}'),
 )  # fmt: skip
-
-
-@cache
-def _sources() -> dict[str, str]:
-    return {path.stem: path.read_text(encoding="utf-8") for path in sorted(FOLDER.glob("*.py"))}
-
-
-@cache
-def _code(module: str, text: str) -> types.CodeType:
-    return compile(re.sub(rf"{re.escape(PACKAGE)}\b", ALIAS, text), f"<{ALIAS}.{module}>", "exec")
-
-
-class _Finder:
-    """Imports the modules of the mutant package from the changed sources."""
-
-    def __init__(self, texts: dict[str, str]) -> None:
-        self._texts = texts
-
-    def find_spec(self, name, _path=None, _target=None):
-        if name == ALIAS:
-            return importlib.util.spec_from_loader(name, self, is_package=True)
-        package, _, module = name.rpartition(".")
-        if package == ALIAS and module in self._texts:
-            return importlib.util.spec_from_loader(name, self)
-        return None
-
-    def create_module(self, _spec):
-        return None
-
-    def exec_module(self, module):
-        stem = "__init__" if module.__name__ == ALIAS else module.__name__.rpartition(".")[2]
-        module.__file__ = str(FOLDER / f"{stem}.py")  # beside which its data are
-        exec(_code(stem, self._texts[stem]), module.__dict__)
-
-
-def load(mutant: Mutant | None) -> types.ModuleType:
-    """Return the package with a defect (or without one) under its other name.
-
-    Raises
-    ------
-    ValueError
-        The text to be changed does not stand in the module exactly once.
-    """
-    texts = dict(_sources())
-    if mutant is not None:
-        text = texts[mutant.module]
-        if text.count(mutant.old) != 1:
-            raise ValueError(
-                f"{mutant.name}: {mutant.module}.py has {text.count(mutant.old)} times {mutant.old!r}"
-            )
-        texts[mutant.module] = text.replace(mutant.old, mutant.new)
-    for name in [name for name in sys.modules if name == ALIAS or name.startswith(f"{ALIAS}.")]:
-        del sys.modules[name]
-    finder = _Finder(texts)
-    sys.meta_path.insert(0, finder)
-    try:
-        package = importlib.import_module(ALIAS)
-        for name in texts.keys() - {"__init__"}:
-            importlib.import_module(f"{ALIAS}.{name}")
-        return package
-    finally:
-        sys.meta_path.remove(finder)

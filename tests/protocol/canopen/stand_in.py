@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import starhil.protocol.canopen
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Row
@@ -22,8 +22,7 @@ class StandInApplication:
         Images by name; names of the images requested by `take_image`.
     """
 
-    def __init__(self, icd: InterfaceDefinition, package=starhil.protocol.canopen) -> None:
-        self._package = package
+    def __init__(self, icd: InterfaceDefinition) -> None:
         self._parameters: dict[str, Value] = {name: item.default for name, item in icd.parameters.items()}
         self.rows: dict[str, dict[str, Value]] = {}
         self.images: dict[str, GreyImage] = {}
@@ -64,8 +63,7 @@ class StandInApplication:
     def image(self, name: str) -> GreyImage:
         """Return the preset image."""
         if name not in self.images:
-            abort = self._package.abort
-            raise abort.SdoAbortError(abort.AbortCode.NO_DATA, name)
+            raise SdoAbortError(AbortCode.NO_DATA, name)
         return self.images[name]
 
     def take_image(self, name: str) -> None:

@@ -2,23 +2,14 @@
 
 from __future__ import annotations
 
-import ast
-from pathlib import Path
-
 import pytest
 
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.runner import run_case
+from tests.planted import LostAimError
+from tests.protocol.canopen.mutants import MUTANTS, Mutant
 
-
-def mutant_names() -> list[str]:
-    """Names of the mutants, without importing them: what pytest shows as the cases of the test."""
-    tree = ast.parse(Path(__file__).with_name("mutants.py").read_text(encoding="utf-8"))
-    return [
-        call.args[0].value
-        for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and getattr(call.func, "id", "") == "Mutant"
-    ]
+pytestmark = pytest.mark.long
 
 
 @pytest.mark.parametrize("case", CANOPEN_CASES, ids=lambda case: case.id)
@@ -65,28 +56,32 @@ def test_safe_cases_change_nothing(simulated_probe):
             assert first >> 5 in {2, 3, 4, 5, 7} or data[2:] == "0" * 14, f"{case.id}: {frame}"
 
 
-@pytest.mark.parametrize("name", mutant_names())
-def test_mutant_is_caught(simulated_probe, mutants, name):
-    mutant = next(mutant for mutant in mutants.MUTANTS if mutant.name == name)
-    probe = simulated_probe(mutants.load(mutant))
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.name)
+def test_mutant_is_caught(simulated_probe, mutant):
     likely_first = sorted(CANOPEN_CASES, key=lambda case: case.area != f"canopen.{mutant.area}")
-    for case in likely_first:
-        probe.port.budget = probe.port.MAX_FRAMES
-        if run_case(probe, case).status == "failed":
-            return
+    with mutant.planted():
+        probe = simulated_probe()
+        for case in likely_first:
+            probe.port.budget = probe.port.MAX_FRAMES
+            if run_case(probe, case).status == "failed":
+                return
     pytest.fail("no case fails")
 
 
-def test_unchanged_copy_is_not_caught(simulated_probe, mutants):
-    probe = simulated_probe(mutants.load(None))
+def test_a_slave_that_was_a_mutant_is_healthy_again(simulated_probe):
+    with MUTANTS[0].planted():
+        simulated_probe()
+    probe = simulated_probe()
     assert [case.id for case in CANOPEN_CASES if run_case(probe, case).status != "passed"] == []
 
 
-def test_there_are_enough_mutants(mutants):
-    names = [mutant.name for mutant in mutants.MUTANTS]
-    assert len(set(names)) == len(names) >= 40
+def test_there_are_enough_mutants():
+    assert len({mutant.name for mutant in MUTANTS}) == len(MUTANTS) >= 40
 
 
-def test_mutant_that_no_longer_applies_is_an_error(mutants):
-    with pytest.raises(ValueError, match="0 times"):
-        mutants.load(mutants.Mutant("x", "sdo", "sdo", "no such text", ""))
+def test_mutant_that_no_longer_applies_is_an_error():
+    with (
+        pytest.raises(LostAimError, match="0 times"),
+        Mutant("x", "sdo", "sdo", "no such text", "").planted(),
+    ):
+        pass

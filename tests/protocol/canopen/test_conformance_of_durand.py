@@ -13,6 +13,8 @@ from durand.scheduler import VirtualScheduler, get_scheduler, set_scheduler
 
 from starhil.protocol.can.frame import CanFrame
 
+pytestmark = pytest.mark.long
+
 NODE = 0x2C
 
 DURAND_FAULTS = {

@@ -12,6 +12,8 @@ from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.unit import load_unit
 
+pytestmark = pytest.mark.long
+
 NODE = 0x2C
 
 

@@ -16,6 +16,8 @@ from starhil.protocol.icd.canopen_schema import CanopenModel
 from starhil.protocol.unit import load_unit
 from starhil.protocol.unit.examples import examine
 
+pytestmark = pytest.mark.lowest("canopen")
+
 ICD = load_unit()
 
 

@@ -8,6 +8,8 @@ from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.runner import run_case
 from tests.protocol.export.dissection import dissect
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture(scope="module")
 def recorded(simulated_probe, tmp_path_factory):

@@ -8,6 +8,8 @@ from durand.network import NetworkABC
 from durand.node import MinimalNode
 from durand.object_dictionary import Record, Variable
 
+pytestmark = pytest.mark.long
+
 NODE = 0x2C
 PIXELS = bytes(number * 5 & 0xFF for number in range(1000))
 

@@ -18,6 +18,8 @@ from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.unit import load_unit
 
+pytestmark = pytest.mark.lowest("canopen")
+
 
 @pytest.fixture(scope="module")
 def eds(tmp_path_factory) -> Path:

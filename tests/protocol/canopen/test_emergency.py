@@ -7,6 +7,8 @@ import pytest
 from starhil.protocol.canopen.abort import AbortCode
 from starhil.protocol.canopen.emergency import ErrorRegister
 
+pytestmark = pytest.mark.lowest("construct")
+
 CODE = 0xFF01
 
 

@@ -14,6 +14,8 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.eds import build_eds
 from tests.waiting import PATIENCE_S, wait_until
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("canopen")]
+
 FRAME = bytes(number * 7 & 0xFF for number in range(937 * 937))
 BOOT_UP, OPERATIONAL = 0, 5
 """NMT states as in a heartbeat."""

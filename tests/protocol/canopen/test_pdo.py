@@ -6,6 +6,8 @@ import pytest
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 
+pytestmark = pytest.mark.lowest("canopen")
+
 OFF = 0x8000_0000
 NO_RTR = 0x4000_0000
 RPDO1 = 0x22C

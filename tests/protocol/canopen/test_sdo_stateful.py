@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from binascii import crc_hqx
 
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -11,6 +12,8 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.abort import AbortCode
 from starhil.protocol.canopen.context import NmtState
+
+pytestmark = pytest.mark.long
 
 IMAGE = bytes(number * 31 & 0xFF for number in range(100))
 IMAGE_MUX = "406001"

@@ -12,6 +12,8 @@ from starhil.protocol.unit import load_unit
 from tests.protocol.canopen.conftest import NODE, Bench
 from tests.protocol.test_fuzz import INPUTS, SEED
 
+pytestmark = pytest.mark.long
+
 IDENTIFIERS = [
     0x000, 0x080, 0x100, 0x080 + NODE, 0x180 + NODE, 0x200 + NODE, 0x300 + NODE, 0x500 + NODE, 0x580 + NODE,
     *[0x600 + NODE] * 12, 0x601, 0x700 + NODE, 0x705, 0x7E4, *[0x7E5] * 3,

@@ -132,6 +132,25 @@ class SlowDisk:
         write_at_once(*self.waiting.pop(0))
 
 
+def test_a_flood_of_new_node_ids_waits_for_one_deletion_of_what_lss_has_stored(new_bench):
+    disk, storage = SlowDisk(), ParameterStorage()
+    bench = new_bench(storage=storage, background=disk).power_on()
+    store, saved = bench.slave.store, []
+    store.save_lss(5, 1_000_000, saved.append)
+    for _ in range(100):
+        store.clear_lss()
+    assert len(disk.waiting) == 2
+    while disk.waiting:
+        disk.write()
+    assert saved == [None]
+    assert storage.load("lss") == {}
+    store.save_lss(6, 1_000_000, saved.append)
+    disk.write()
+    store.clear_lss()
+    disk.write()
+    assert storage.load("lss") == {}
+
+
 STORE_ALL, STORED = "23 10 10 01 73 61 76 65", "6010100100000000"
 
 

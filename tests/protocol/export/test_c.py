@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import random
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from starhil.protocol.can.cubespace import CanHostReceiver, encode_reply_frames, encode_request_frames
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export.c import prefix_of, render_folder
-from starhil.protocol.icd import FieldError
+from starhil.protocol.icd import FieldError, UnknownNameError
 from starhil.protocol.icd.codec import Row
+from starhil.protocol.icd.quoting import c_member
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
@@ -24,6 +27,8 @@ from tests.protocol.export.c_driver import CDriver, c_words, hex_or_none
 from tests.protocol.export.test_export import by_name, packets
 from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
 from tests.test_your_unit import written
+
+pytestmark = pytest.mark.long
 
 ICD = load_unit()
 ROWS = [row for row in ICD.rows if row.named_fields]
@@ -283,6 +288,39 @@ def test_the_rows_of_a_unit_have_the_same_bytes_and_values_both_ways(name: str, 
                 refused_at(row, data),
                 c_words(row, row.decode(data, check=False)),
             )
+
+
+def test_only_the_chosen_rows_have_code(tmp_path: Path) -> None:
+    header, source = render_folder(ICD, ["set_mode", "precise_attitude"]).values()
+    written_rows = set(re.findall(r"\bcubestar_(?:tc|tlm)_(\w+)_encode\b", header + source))
+    assert written_rows == {"set_mode", "precise_attitude"}
+    whole = "".join(render_folder(ICD).values())
+    assert len(header + source) < 0.2 * len(whole)
+    with CDriver(ICD.with_rows(["set_mode", "precise_attitude"]), tmp_path) as driver:
+        row = ICD.telemetry["precise_attitude"]
+        for values, data in packets(row):
+            assert driver("encode", row.name, *c_words(row, values)) == ["0", data.hex()]
+    with pytest.raises(UnknownNameError, match="did you mean precise_attitude"):
+        render_folder(ICD, ["precise_atitude"])
+
+
+@pytest.mark.parametrize("name", ["cubestar", "cubestar-gen2"])
+def test_a_member_is_a_double_only_if_a_float_would_round_its_steps(name: str) -> None:
+    icd = load_unit(name)
+    header, _ = render_folder(icd).values()
+    prefix = prefix_of(icd)
+    counts = Counter[bool]()
+    for row in icd.rows:
+        kind = "tc" if row.kind == "telecommand" else "tlm"
+        members = re.search(rf"typedef struct {{([^}}]*)}} {prefix}_{kind}_{row.name}_t;", header)
+        for field in row.named_fields.values():
+            if field.scaled and field.kind != "float" and members is not None:
+                largest = max(abs(float(field.to_physical(limit))) for limit in field.raw_limits)
+                roundings = abs(field.scale) / float(np.spacing(np.float32(max(largest, abs(field.bias)))))
+                double = f"double {c_member(field.name)};" in members[1]
+                assert roundings < 256 if double else roundings > 32, (row.name, field.name)
+                counts[double] += 1
+    assert counts[False] > 50
 
 
 def test_the_header_has_version_and_checksum_of_the_definition() -> None:

@@ -22,6 +22,8 @@ from starhil.protocol.unit import load_unit
 from tests.protocol.export.c_driver import CDriver, hex_or_none
 from tests.protocol.serial.composed_links import REPLIES, REQUESTS, STACKS, definition
 
+pytestmark = pytest.mark.long
+
 
 def python_link(name: str) -> Any:
     stack = STACKS[name]

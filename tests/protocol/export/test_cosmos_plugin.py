@@ -16,6 +16,8 @@ from tests.protocol.export.cosmos_plugin import Plugin
 from tests.protocol.export.test_export import packets
 from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
 
+pytestmark = pytest.mark.long
+
 ICD = load_unit()
 ANSWER = answer_id(ICD)
 

@@ -35,6 +35,8 @@ from starhil.protocol.serial.stack import SerialStack
 from starhil.protocol.unit import load_unit
 from starhil.protocol.unit.examples import exchanges
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("jinja2")]
+
 ICD = load_unit()
 TELEMETRY = [row for row in ICD.rows if row.kind == "telemetry"]
 TELECOMMANDS = [row for row in ICD.rows if row.kind == "telecommand"]

@@ -3,6 +3,7 @@
 import os
 import re
 import socket
+import stat
 import time
 
 import pytest
@@ -28,6 +29,7 @@ from starhil.protocol.files.user_file import (
 from starhil.protocol.unit import load_unit
 from starid.camera.file import load_camera
 from starid.errors import StaridError
+from starid.storage.files import read_bytes
 
 READERS = {
     "truth file": read_truth_file,
@@ -103,6 +105,20 @@ def test_a_setting_that_is_not_toml_is_text(value):
     with pytest.raises(EmulatorError, match="seed: must be a whole number") as refusal:
         load_profile("demo", [f"run.seed={value}"])
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("reader", [lambda path: read_user_file(path), lambda path: read_bytes(path, 9)])
+def test_a_file_that_has_nothing_yet_is_rejected_without_waiting(tmp_path, monkeypatch, reader):
+    """Such files are in /proc: here a pipe is taken for one."""
+    path = tmp_path / "kmsg"
+    os.mkfifo(path)
+    monkeypatch.setattr(stat, "S_ISREG", lambda _mode: True)
+    descriptor = os.open(path, os.O_RDWR)
+    try:
+        with pytest.raises(OSError, match="Resource temporarily unavailable"):
+            reader(path)
+    finally:
+        os.close(descriptor)
 
 
 def test_a_file_is_read_completely_or_rejected_above_the_limit(tmp_path):

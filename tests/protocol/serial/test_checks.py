@@ -11,6 +11,8 @@ from starhil.protocol.errors import IcdError
 from starhil.protocol.icd.link_schema import CheckModel
 from starhil.protocol.serial.checks import build_check
 
+pytestmark = pytest.mark.lowest("xxhash")
+
 DIGITS = b"123456789"
 ADAPTER: TypeAdapter[Any] = TypeAdapter(CheckModel)
 

@@ -22,6 +22,8 @@ from starhil.protocol.transports.python_can import QUEUE_LIMIT, PythonCanTranspo
 from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, CanPair, can_pair
 from tests.waiting import PATIENCE_S, until
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("python-can")]
+
 MARK = CanFrame(0x7A5, b"end", extended=False)
 
 
@@ -240,6 +242,22 @@ def test_only_classic_frames_are_received() -> None:
         await transport.close()
         assert [(frame.id, frame.data) for frame in got] == [(2, b"\x07")]
         assert (errors, transport.statistics.received) == ([], 1)
+
+    asyncio.run(main())
+
+
+def test_a_controller_that_is_bus_off_again_and_again_is_reported_once() -> None:
+    """The kernel restarts it every few milliseconds, and each time was a line of the log."""
+
+    async def main() -> None:
+        bus_off = can.Message(arbitration_id=0x40, is_error_frame=True, data=bytes(8))
+        restarted = can.Message(arbitration_id=0x100, is_error_frame=True, data=bytes(8))
+        frame = can.Message(arbitration_id=2, is_extended_id=False)
+        bus = _ScriptedBus(*[bus_off, restarted, frame] * 200)
+        transport, got, errors = await _open(bus)
+        await until(lambda: len(got) == 200)
+        await transport.close()
+        assert ["bus-off" in str(error) for error in errors] == [True]
 
     asyncio.run(main())
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -14,6 +15,8 @@ from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.connections import WINDOW
 from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub, FairQueue
 from tests.waiting import PATIENCE_S, turns, until
+
+pytestmark = pytest.mark.long
 
 FLOOD = CanFrame(0x123, bytes(8), extended=False)
 REQUEST = CanFrame(0x200, b"\x01", extended=False)

@@ -26,6 +26,8 @@ from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub
 from tests.candump import read_candump
 from tests.waiting import PATIENCE_S
 
+pytestmark = pytest.mark.long
+
 
 class Peer:
     """A client that speaks the text protocol by hand."""

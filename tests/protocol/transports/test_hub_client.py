@@ -21,6 +21,8 @@ from starhil.protocol.transports.hub_client import AutoHubTransport
 from tests.protocol.transports.pairs import FRAMES, CanPair
 from tests.waiting import until
 
+pytestmark = pytest.mark.long
+
 
 def test_a_restarted_hub_is_found_again() -> None:
     async def main() -> None:

@@ -21,6 +21,8 @@ from starhil.protocol.transports.serial import open_serial
 from tests.protocol.transports.pairs import FRAMES
 from tests.waiting import until
 
+pytestmark = pytest.mark.long
+
 SLOW_BAUD = 9600
 QUEUED = (bytes(120),) * 100
 """Messages for 12.5 s of a line at 9600 baud: longer than `until` waits."""

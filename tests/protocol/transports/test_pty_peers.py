@@ -15,6 +15,8 @@ from starhil.protocol.transports.paced import SerialTransport
 from starhil.protocol.transports.serial import open_serial
 from tests.waiting import turns, until
 
+pytestmark = pytest.mark.long
+
 MESSAGE = bytes(range(100))
 REQUEST = b"request"
 

@@ -21,6 +21,8 @@ from tests.conformance.simulated import SimulatedLoop
 from tests.protocol.transports.pairs import SERIAL_KINDS, serial_pair
 from tests.waiting import PATIENCE_S, until
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("pyserial")]
+
 
 @pytest.mark.parametrize("kind", SERIAL_KINDS)
 def test_bytes_of_every_value_pass_both_ways(kind: str, tmp_path: Path) -> None:

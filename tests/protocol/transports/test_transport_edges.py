@@ -9,6 +9,8 @@ from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.serial import open_serial
 from tests.waiting import until
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize("host", ["127.0.0..1", "x" * 300])
 @pytest.mark.parametrize("kind", ["socket", "listen", "socketcand"])

@@ -18,6 +18,8 @@ from starhil.protocol.icd.values import LengthError, MessageError, Value, to_f32
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.unit import load_unit
 
+pytestmark = pytest.mark.lowest("pydantic")
+
 ICD = load_unit()
 ROWS = list(ICD.rows)
 

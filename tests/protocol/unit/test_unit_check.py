@@ -136,6 +136,29 @@ def test_a_plugin_that_fails_is_one_line_and_status_1(tmp_path: Path, source: st
     assert sum(message in line for line in said.splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        (
+            "snapshot.frame.result.matched",
+            "quantity seven without a frame: AttributeError: 'NoneType' object",
+        ),
+        (
+            "0 if snapshot.frame is None else snapshot.frame.stars",
+            "quantity seven with an attitude: AttributeError",
+        ),
+        ("'seven'", "row.a: 'seven' is not a number"),
+        ("len(snapshot.stars) + 300", ""),
+        ("None", ""),
+    ],
+)
+def test_each_quantity_of_a_plugin_is_called(tmp_path: Path, source: str, message: str) -> None:
+    folder = written(tmp_path, PLUGIN.replace("return 7", f"return {source}"))
+    code, said = unit_check(folder)
+    assert (code, message in said) == (int(bool(message)), True), said
+    assert unit_check("--no-plugin", folder)[0] == 0
+
+
 def test_a_framing_without_its_methods_is_one_line(tmp_path: Path) -> None:
     code, said = unit_check(written(tmp_path, PLUGIN.replace("def encode", "def code")))
     assert (code, "fails in framing lines: TypeError: Can't instantiate abstract class Lines" in said) == (

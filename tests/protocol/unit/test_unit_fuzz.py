@@ -15,6 +15,8 @@ from starhil.protocol.serial.stack import SerialStack
 from starhil.protocol.unit import load_unit
 from tests.protocol.mutations import mutated
 
+pytestmark = pytest.mark.long
+
 INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "1500"))
 SEED = 20261122
 UNITS = [name for name in bundled_units() if load_unit(name).link.serial is not None]

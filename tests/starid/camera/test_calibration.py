@@ -14,11 +14,14 @@ from scipy.optimize import least_squares
 from starid.attitude import Attitude, random_attitude
 from starid.attitude.wahba import solve_wahba
 from starid.camera import DEFAULT_CAMERA, Camera
-from starid.camera.calibration import NAMES, Calibration, CalibrationFrame, attitude_covariance, calibrate
+from starid.camera.calibration import NAMES, Calibration, CalibrationFrame, calibrate
 from starid.camera.file import load_camera, save_camera
+from starid.camera.position_errors import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.photograph.self_calibration import IMAGE_MODELS, Stars, _best, self_calibrate
+
+pytestmark = pytest.mark.long
 
 WIDE = Camera(937, 937, (1230.0, 1226.0), (474.0, 463.0), "pinhole", (-0.06, 0.03, 8e-4, -5e-4, 0.0))
 NARROW = Camera(1024, 768, (5100.0, 5100.0), (512.0, 384.0), "pinhole", (-0.5, 0.0, 0.0, 0.0, 0.0))

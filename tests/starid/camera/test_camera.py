@@ -18,6 +18,8 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.camera.camera import flat_view
 from starid.errors import StaridError
 
+pytestmark = pytest.mark.lowest("numpy")
+
 ROUND_TRIP_PX = 1e-6
 SAME_AS_OPENCV_PX = 1e-9
 

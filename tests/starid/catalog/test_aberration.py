@@ -18,6 +18,8 @@ from starid.identification.geometric.identifier import Identifier
 from starid.identification.tracker import Tracker
 from starid.lab.classic.registry import make_identifier
 
+pytestmark = pytest.mark.long
+
 NEW_YEAR = 1_767_225_600.0
 YEAR_S = 365.25 * 86400.0
 MICROARCSEC = 1e-6 / ARCSEC_PER_RAD

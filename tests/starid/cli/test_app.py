@@ -21,6 +21,8 @@ from starid.cli import app, identify
 from tests.emulator.cli.command_line import run_command_line
 from tests.waiting import PATIENCE_S
 
+pytestmark = pytest.mark.long
+
 ROOT = Path(__file__).parents[3]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 NOT_OF_THE_ENGINE = {

@@ -16,6 +16,8 @@ from starid.catalog import load_catalog
 from starid.cli.app import main
 from starid.imaging.image_io import write_image
 
+pytestmark = pytest.mark.long
+
 LENS = Camera(640, 512, (850.0, 850.0), (322.0, 250.0), "pinhole", (-0.08, 0.02, 0.0, 0.0, 0.0))
 POINTINGS = [(83.8, -1.2, 30.0), (283.0, 35.0, 200.0), (190.0, -60.0, 100.0), (170.0, 55.0, 300.0)]
 

@@ -9,6 +9,8 @@ import pytest
 
 from starid.cli.app import main
 
+pytestmark = pytest.mark.long
+
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
     monkeypatch.setattr("sys.argv", ["starid", "catalog", *arguments])

@@ -10,6 +10,8 @@ from typer.testing import CliRunner
 from starid.cli.app import build_app
 from starid.errors import StaridError
 
+pytestmark = pytest.mark.long
+
 runner = CliRunner()
 
 

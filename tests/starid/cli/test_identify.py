@@ -18,6 +18,8 @@ from starid.identification.solution import Reason, Solution
 from starid.identification.star_identifier import make_identifier
 from starid.imaging.detection import detect
 
+pytestmark = pytest.mark.long
+
 RUNNER = CliRunner()
 DEGREE_LIMIT = 0.01
 

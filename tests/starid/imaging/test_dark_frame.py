@@ -8,6 +8,8 @@ import pytest
 from starid.errors import StaridError
 from starid.imaging.dark_frame import dark_excess, without_dark
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("opencv")]
+
 SIDE = 40
 
 

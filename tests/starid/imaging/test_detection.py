@@ -15,6 +15,8 @@ from starid.catalog.photometry import fitted_share
 from starid.errors import StaridError
 from starid.imaging.detection import Detections, DetectionSettings, detect
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("numba")]
+
 SIGMA = 0.8
 SKY, NOISE, GAIN = 40.0, 3.0, 2.0
 KNOWN = DetectionSettings(gain_e_per_dn=GAIN)

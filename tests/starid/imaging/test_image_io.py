@@ -16,6 +16,8 @@ import starid
 from starid.errors import StaridError
 from starid.imaging.image_io import read_image, write_image
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("opencv")]
+
 RNG = np.random.default_rng(8)
 GREY8 = RNG.integers(0, 255, (60, 80), dtype=np.uint8)
 GREY16 = RNG.integers(0, 65535, (60, 80), dtype=np.uint16)

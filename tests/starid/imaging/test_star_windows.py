@@ -9,6 +9,8 @@ from starid.errors import StaridError
 from starid.imaging.detection import DetectionSettings, detect
 from starid.imaging.star_windows import MAX_RADIUS_PX, detect_near
 
+pytestmark = pytest.mark.long
+
 SIZE, LEVEL, NOISE, SIGMA = 400, 40.0, 2.0, 1.1
 SETTINGS = DetectionSettings(psf_sigma_px=SIGMA, gain_e_per_dn=10.0)
 

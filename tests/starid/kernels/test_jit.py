@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +21,8 @@ from starid.kernels import kernel_cache
 from starid.kernels.jit import compiled, compiled_ieee, inner, inner_checked
 from starid.storage.cache import cached_files, remove
 from tests.waiting import PATIENCE_S
+
+pytestmark = [pytest.mark.long, pytest.mark.lowest("numba")]
 
 CALLER = """
 from other_kernels.inner import FACTOR, scaled
@@ -186,6 +189,35 @@ def test_files_without_a_checksum_are_kept_while_their_process_may_run(cache_fol
     assert (new.exists(), old.exists()) == (True, False)
 
 
+def test_what_a_process_replaces_while_another_one_records_is_kept(
+    cache_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of processes that started together, the last one to write had read the file before: all was compiled again."""
+    folder = cache_folder / "kernels" / "0123456789abcdef"
+    path = folder / "package" / "kernel.nbc"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"code of the first")
+    read, others = kernel_cache._checksum, []
+
+    def replace() -> None:
+        path.write_bytes(b"code of the second")
+        kernel_cache.record_checksums(folder)
+
+    def checksum(file: Path) -> int:
+        found = read(file)
+        if not others:
+            others.append(threading.Thread(target=replace))
+            others[0].start()
+            others[0].join(1.0)
+        return found
+
+    monkeypatch.setattr(kernel_cache, "_checksum", checksum)
+    kernel_cache.record_checksums(folder)
+    others[0].join()
+    kernel_cache.remove_damaged(folder)
+    assert path.exists()
+
+
 @pytest.mark.parametrize("text", ["", "{", "[1]", '{"package/gone.nbc": 1}'])
 def test_a_damaged_list_of_checksums_is_written_again(cache_folder: Path, text: str) -> None:
     folder = cache_folder / "kernels" / "0123456789abcdef"
@@ -302,7 +334,7 @@ def sources() -> Iterator[Path]:
 
 
 def test_only_what_numba_publishes_is_used_and_sums_are_never_reordered() -> None:
-    """numba is imported in one module, for `njit` with documented options; no name with an underscore, no fastmath."""
+    """numba is imported in one module, for `njit` and `register_jitable` with documented options; no name with an underscore, no fastmath."""
     documented = {"nogil", "cache", "error_model"}
     users = []
     for path in sources():
@@ -321,7 +353,10 @@ def test_only_what_numba_publishes_is_used_and_sums_are_never_reordered() -> Non
                     continue
             if any(each.partition(".")[0] in ("numba", "llvmlite") for each in modules):
                 users.append((path.name, ast.unparse(node)))
-    assert users == [("jit.py", "from numba import njit")]
+    assert users == [
+        ("jit.py", "from numba import njit"),
+        ("jit.py", "from numba.extending import register_jitable"),
+    ]
     tree = ast.parse((Path(starid.__file__).parent / "kernels" / "jit.py").read_bytes())
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
     options = {word.arg for call in calls if ast.unparse(call.func) == "njit" for word in call.keywords}

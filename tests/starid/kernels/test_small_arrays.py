@@ -9,6 +9,8 @@ from starid.arrays import Array
 from starid.kernels.jit import compiled_ieee
 from starid.kernels.small_arrays import lower_median, median
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("numba")]
+
 
 @compiled_ieee
 def both(values: Array, count: int) -> tuple[float, float]:

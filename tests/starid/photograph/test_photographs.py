@@ -24,6 +24,8 @@ from starid.photograph.typical_camera import typical_camera
 from starid.photograph.views import View, correlation, has_dark_tail, views
 from tests.starid.photograph.night_sky import FOV_DEG, HEIGHT, WIDTH, photograph
 
+pytestmark = pytest.mark.long
+
 CENTRE_ARCSEC = 10.0
 NOMINAL = Camera.from_fov(FOV_DEG * 0.92, WIDTH, HEIGHT)
 

@@ -76,7 +76,6 @@ export class Charts {
     document.getElementById("save-csv").addEventListener("click", () => save("starhil.csv", new Blob([this.csv()], { type: "text/csv" })));
     document.getElementById("statistics").addEventListener("toggle", () => this.schedule());
     this.modes.addEventListener("click", (event) => store.scrub(this.from + (event.offsetX / this.modes.clientWidth) * (this.to - this.from)));
-    this.host.addEventListener("keydown", (event) => this.key(event));
   }
 
   setWindow(seconds) {
@@ -91,13 +90,9 @@ export class Charts {
     this.setWindow(WINDOWS[(at + 1) % WINDOWS.length][0]);
   }
 
-  key(event) {
-    const moves = { PageUp: -0.5, PageDown: 0.5 };
-    if (event.key in moves) this.store.scrub((this.store.cursor ?? this.store.now) + moves[event.key] * (this.to - this.from));
-    else if (event.key === "Home") this.store.scrub(-Infinity);
-    else if (event.key === "End") this.store.scrub(null);
-    else return;
-    event.preventDefault();
+  // Move in time, by a share of the span.
+  move(share) {
+    this.store.scrub((this.store.cursor ?? this.store.now) + share * (this.to - this.from));
   }
 
   schedule() {
@@ -225,7 +220,7 @@ export class Charts {
       padding: [0.4 * rem, 0.9 * rem, last ? 0 : 0.3 * rem, 0],
       scales: { x: { time: false, range: () => [this.from, this.to] }, y: { range: () => own.range } },
       axes: [
-        { ...axis, show: true, size: last ? 1.5 * rem : 2, splits: () => Array.from({ length: 7 }, (_, part) => this.to - ((this.to - this.from) * (6 - part)) / 6), values: (_, times) => times.map((time) => (last ? before(time - this.store.now) : "")) },
+        { ...axis, show: true, size: last ? 1.5 * rem : 2, splits: () => Array.from({ length: 7 }, (_, part) => this.to - ((this.to - this.from) * (6 - part)) / 6), values: (_, times) => times.map((time) => (last ? before(time - this.store.present) : "")) },
         { ...axis, size: 3.6 * rem, space: 1.6 * rem, values: (_, values) => values.map((item) => String(Number(item.toPrecision(6))).replace("-", "−")) },
       ],
       series,
@@ -282,7 +277,7 @@ export class Charts {
       [this.from, this.to] = this.zoomed;
       return;
     }
-    if (store.cursor === null) this.to = store.imageless ? store.time : store.now;
+    if (store.cursor === null) this.to = store.present;
     else {
       this.to = Math.min(this.to ?? store.now, Math.max(store.now, store.time));
       if (store.cursor > this.to) this.to = store.cursor;

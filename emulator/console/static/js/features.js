@@ -55,8 +55,8 @@ export function drawRemoved(context, head, place) {
   }
 }
 
-// Draw the region of search; `line` draws a line of right ascensions and declinations.
-export function drawRegion(context, head, line) {
+// Draw the region of search in a colour; `line` draws a line of right ascensions and declinations.
+export function drawRegion(context, head, ink, line) {
   const known = head.features;
   if (!known || !known.region_deg) return;
   const [ra, dec] = known.region_at_deg;
@@ -67,7 +67,7 @@ export function drawRegion(context, head, line) {
   for (let i = -SIDE_PARTS; i <= SIDE_PARTS; i++) points.push([ra + (wide * i) / SIDE_PARTS, low]);
   for (let i = SIDE_PARTS; i >= -SIDE_PARTS; i--) points.push([ra + (wide * i) / SIDE_PARTS, high]);
   points.push(points[0]);
-  context.strokeStyle = colour("good");
+  context.strokeStyle = colour(ink);
   context.lineWidth = 2 * pen();
   line(points.map(([a, d]) => [(a + 360) % 360, d]));
 }

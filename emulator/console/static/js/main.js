@@ -304,8 +304,8 @@ $("live").addEventListener("click", toggleLive);
 
 const KEYS = [
   ["", " ", "space", "pause, or back to live", toggleLive],
-  ["", "ArrowLeft", "←", "one frame back; with Shift ten", (event) => store.step(event.shiftKey ? -10 : -1)],
-  ["", "ArrowRight", "→", "one frame on; with Shift ten", (event) => store.step(event.shiftKey ? 10 : 1)],
+  ["", "ArrowLeft", "←", "one frame back; with Shift ten", () => store.step(-1)],
+  ["", "ArrowRight", "→", "one frame on; with Shift ten", () => store.step(1)],
   ["sky", "1", "1 … 4", "layers over the sky", () => sky.toggle("matched")],
   ["sky", "2", "", "", () => sky.toggle("unmatched")],
   ["sky", "3", "", "", () => sky.toggle("missing")],
@@ -314,13 +314,24 @@ const KEYS = [
   ["sky", "=", "", "", () => sky.zoomCentre(1.4)],
   ["sky", "-", "", "", () => sky.zoomCentre(1 / 1.4)],
   ["sky", "0", "", "", () => sky.reset()],
-  ["sky", "n", "n p", "next and previous star; Shift with arrows: move the enlarged image", () => {}],
-  ["charts", "w", "w", "another time span; Page Up, Page Down, Home, End: move in time", () => charts.nextWindow()],
+  ["sky", "n", "n p", "next star to the right, to the left", () => sky.go(1)],
+  ["sky", "p", "", "", () => sky.go(-1)],
+  ["sky", "Shift+ArrowLeft", "Shift with arrows", "move the enlarged image", () => sky.pan(-1, 0)],
+  ["sky", "Shift+ArrowRight", "", "", () => sky.pan(1, 0)],
+  ["sky", "Shift+ArrowUp", "", "", () => sky.pan(0, -1)],
+  ["sky", "Shift+ArrowDown", "", "", () => sky.pan(0, 1)],
+  ["charts", "w", "w", "another time span", () => charts.nextWindow()],
+  ["charts", "PageUp", "Page Up, Page Down, Home, End", "move in time", () => charts.move(-0.5)],
+  ["charts", "PageDown", "", "", () => charts.move(0.5)],
+  ["charts", "Home", "", "", () => store.scrub(-Infinity)],
+  ["charts", "End", "", "", () => store.scrub(null)],
   ["charts", "m", "m", "a note at this moment; also in Sky", () => note()],
   ["sky", "m", "", "", () => note()],
   ["faults", "c", "c", "cover or uncover the lens", () => panels.faults.toggleCover()],
   ["truth", "s", "s", "step the stepped clock", () => panels.truth.step()],
   ["truth", "r", "r", "run or pause the stepped clock", () => panels.truth.toggleClock()],
+  ["", "Shift+ArrowLeft", "", "", () => store.step(-10)], // elsewhere than in Sky, which comes first
+  ["", "Shift+ArrowRight", "", "", () => store.step(10)],
 ];
 function note() {
   openTab("events");
@@ -346,10 +357,11 @@ document.addEventListener("keydown", (event) => {
   const { target } = event;
   if (target.closest("input, select, textarea, dialog, [role=tab]") || (event.key === " " && target.closest("button, a, summary"))) return;
   if (event.key.startsWith("Arrow") && target.closest(".scroll")) return;
-  const found = KEYS.find(([part, key]) => key === event.key && (!part || target.closest(`#${part}`)));
+  const pressed = event.shiftKey && event.key.startsWith("Arrow") ? `Shift+${event.key}` : event.key;
+  const found = KEYS.find(([part, key]) => key === pressed && (!part || target.closest(`#${part}`)));
   if (!found) return;
   event.preventDefault();
-  found[4](event);
+  found[4]();
 });
 
 // The part that is clicked has the keys.

@@ -1,5 +1,6 @@
 // The whole sky in Hammer's equal-area projection: bright stars, the trail of the boresight, Sun, Moon and Earth.
 
+import { toSky } from "./directions.js";
 import { drawRegion } from "./features.js";
 import { colour, onTheme, pen } from "./theme.js";
 
@@ -116,7 +117,7 @@ export class SkyMap {
     const head = store.image && store.image.head;
     for (const body of (head && head.bodies) || []) this.drawBody(context, body);
     if (head && head.true_q && store.hello.camera) this.drawField(context, head);
-    if (head) drawRegion(context, head, (points) => this.line(context, points));
+    if (head) drawRegion(context, head, "good", (points) => this.line(context, points));
     context.fillStyle = colour("b");
     context.beginPath();
     context.arc(...this.place(...trail[0]), 3 * pen(), 0, 2 * Math.PI);
@@ -156,18 +157,6 @@ export class SkyMap {
     context.lineWidth = 1.2 * pen();
     this.line(context, points);
   }
-}
-
-// A direction in the sensor frame as right ascension and declination: v = q* s q.
-function toSky([a, b, c], [x, y, z, w]) {
-  const length = Math.hypot(a, b, c);
-  const s = [a / length, b / length, c / length];
-  const q = [-x, -y, -z];
-  const cross = (m, n) => [m[1] * n[2] - m[2] * n[1], m[2] * n[0] - m[0] * n[2], m[0] * n[1] - m[1] * n[0]];
-  const t = cross(q, s).map((item) => 2 * item);
-  const u = cross(q, t);
-  const v = s.map((item, i) => item + w * t[i] + u[i]);
-  return [(Math.atan2(v[1], v[0]) / RAD + 360) % 360, Math.asin(Math.max(-1, Math.min(1, v[2]))) / RAD];
 }
 
 // A small circle around a direction.

@@ -1,9 +1,11 @@
 // The sensor image with matched, unmatched and missing stars.
 
-import { drawRemoved } from "./features.js";
+import { toSensor } from "./directions.js";
+import { drawRegion, drawRemoved } from "./features.js";
 import { fixed, press, save, say, setText } from "./format.js";
 import { colour, onTheme, pen } from "./theme.js";
 
+const PAN_PX = 40;
 const HOVER_PX = 14;
 const MAX_ZOOM = 16;
 const SPOKEN_MS = 5000;
@@ -24,7 +26,6 @@ export class Sky {
     this.pointer = null;
     this.decoding = false;
     this.stars = []; // what can be pointed at: place and text
-    this.chosen = -1; // number of the star chosen by keys
     this.painted = 0; // images drawn since the page was opened
     store.on("shown", () => this.show());
     store.on("status", () => this.show());
@@ -43,7 +44,6 @@ export class Sky {
     apply();
     document.getElementById("zoom-reset").addEventListener("click", () => this.reset());
     document.getElementById("save-image").addEventListener("click", () => this.png());
-    this.stage.addEventListener("keydown", (event) => this.key(event));
     this.stage.addEventListener("wheel", (event) => {
       if (this.zoom === 1 && event.deltaY > 0) return; // the page scrolls on
       event.preventDefault();
@@ -71,21 +71,22 @@ export class Sky {
     });
   }
 
-  // Pan with Shift and arrows; go from star to star with n and p.
-  key(event) {
-    const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-    if (step && event.shiftKey) {
-      for (const axis of [0, 1]) this.offset[axis] += (40 * step[axis]) / this.scale();
-      this.draw();
-    } else if ((event.key === "n" || event.key === "p") && this.stars.length && !event.ctrlKey) {
-      this.chosen = (this.chosen + (event.key === "n" ? 1 : -1) + this.stars.length) % this.stars.length;
-      const [x, y, text] = this.stars[this.chosen];
-      this.pointer = this.place(x, y);
-      this.point();
-      say(text.replaceAll("\n", ", "));
-    } else return;
-    event.preventDefault();
-    event.stopPropagation();
+  // Move the enlarged image.
+  pan(right, down) {
+    this.offset[0] += (PAN_PX * right) / this.scale();
+    this.offset[1] += (PAN_PX * down) / this.scale();
+    this.draw();
+  }
+
+  // Point at the next star to the right (1) or left (-1) of the one under the pointer, which noise from image to image hardly reorders.
+  go(step) {
+    if (!this.stars.length) return;
+    const ordered = [...this.stars].sort(([a], [b]) => a - b);
+    const at = ordered.indexOf(this.nearest());
+    const star = ordered.at(at < 0 && step < 0 ? -1 : (at + step) % ordered.length);
+    this.pointer = this.place(star[0], star[1]);
+    this.point();
+    say(star[2].replaceAll("\n", ", "));
   }
 
   // The image with its marks, as shown.
@@ -158,9 +159,9 @@ export class Sky {
     this.painted += bitmap ? 1 : 0;
     if (image) this.say(bitmap ? "" : "this image cannot be decoded");
     this.stars = image ? this.describe(image.head) : [];
-    this.chosen = -1;
     this.speak();
     this.draw();
+    this.point();
     if (this.store.image !== image) this.show();
   }
 
@@ -223,6 +224,7 @@ export class Sky {
     if (this.layers.bodies) this.drawBodies(marks, head);
     this.drawStars(marks, head);
     drawRemoved(marks, head, (x, y) => this.place(x, y));
+    drawRegion(marks, head, "on-sky-rate", (points) => this.skyLine(marks, head, points));
     if (this.layers.bodies) this.drawRate(marks, head);
     this.point();
   }
@@ -355,6 +357,16 @@ export class Sky {
     context.lineWidth = 1.4 * pen();
   }
 
+  // A line through right ascensions and declinations in front of the camera, whose distortion is left out.
+  skyLine(context, head, points) {
+    const { focal_px: focal, centre_px: centre } = this.store.hello.camera;
+    const seen = points.map((point) => toSensor(point, head.true_q));
+    if (!focal || !centre || seen.some(([, , z]) => z < 0.1)) return;
+    context.beginPath();
+    for (const [x, y, z] of seen) context.lineTo(...this.place(centre[0] + (focal[0] * x) / z, centre[1] + (focal[1] * y) / z));
+    context.stroke();
+  }
+
   // Motion of the boresight: with the body rate ω it is ω × z = (ω_y, −ω_x).
   drawRate(context, head) {
     const { index } = this.store.rows;
@@ -404,22 +416,23 @@ export class Sky {
     return found;
   }
 
-  // Describe the object under the pointer.
-  point() {
-    if (!this.pointer || !this.shown) return;
-    let best = HOVER_PX;
-    let text = "";
-    for (const [x, y, what] of this.stars) {
+  // The star under the pointer.
+  nearest() {
+    if (!this.pointer || !this.shown) return undefined;
+    const distances = this.stars.map(([x, y]) => {
       const [px, py] = this.place(x, y);
-      const distance = Math.hypot(px - this.pointer[0], py - this.pointer[1]);
-      if (distance < best) {
-        best = distance;
-        text = what;
-      }
-    }
-    this.hover.hidden = !text;
-    if (!text) return;
-    this.hover.textContent = text;
+      return Math.hypot(px - this.pointer[0], py - this.pointer[1]);
+    });
+    const least = Math.min(...distances);
+    return least < HOVER_PX ? this.stars[distances.indexOf(least)] : undefined;
+  }
+
+  // Describe the star under the pointer.
+  point() {
+    const star = this.nearest();
+    this.hover.hidden = !star;
+    if (!star) return;
+    [, , this.hover.textContent] = star;
     const left = Math.min(this.pointer[0] + 14, this.stage.clientWidth - this.hover.offsetWidth - 4);
     const top = Math.min(this.pointer[1] + 14, this.stage.clientHeight - this.hover.offsetHeight - 4);
     this.hover.style.transform = `translate(${left}px, ${top}px)`;

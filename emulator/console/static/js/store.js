@@ -201,6 +201,11 @@ export class Store {
     return !this.rows || !this.rows.length || !this.rows.isFrame(this.rows.end - 1) || this.time - this.now > OVERDUE_S;
   }
 
+  // The moment that a live plot ends at.
+  get present() {
+    return this.imageless ? this.time : this.now;
+  }
+
   // Position of the row that is shown.
   get position() {
     if (!this.rows || !this.rows.length) return -1;

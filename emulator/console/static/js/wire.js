@@ -5,6 +5,9 @@ import { fixed, make, press, say, setText, value, wall } from "./format.js";
 
 const KEPT_LINES = 1000;
 const SHOWN_LINES = 400;
+const PAUSE_MS = 100;
+const FLOOD_PAUSE_MS = 1000; // between two renderings of more lines than anyone can read
+const FLOOD_LINES = 50;
 const HUES = 6;
 const KINDS = [["requests", ["telecommand", "telemetry"]], ["replies", ["ack", "reply"]], ["refusals, faults", ["nack", "fault"]], ["parts", ["part"]], ["CANopen", ["canopen"]]];
 
@@ -20,6 +23,8 @@ export class Wire {
     this.own = false;
     this.text = "";
     this.held = false;
+    this.pending = null;
+    this.fresh = 0;
     this.build();
     store.on("hello", (hello) => this.begin(hello));
     store.on("wire", (message) => this.add(message));
@@ -75,7 +80,7 @@ export class Wire {
     this.lines.push(...message.items.filter((line) => line.n > last));
     if (this.lines.length > KEPT_LINES) this.lines.splice(0, this.lines.length - KEPT_LINES);
     setText(this.left, message.left_out ? `${message.left_out} left out` : "");
-    this.render();
+    this.pending ??= setTimeout(() => { this.pending = null; this.render(); }, this.fresh > FLOOD_LINES ? FLOOD_PAUSE_MS : PAUSE_MS);
   }
 
   wanted(line) {
@@ -95,6 +100,7 @@ export class Wire {
       before = line.t;
       return item;
     });
+    this.fresh = items.length;
     this.list.prepend(...items.reverse());
     while (this.list.children.length > SHOWN_LINES) this.list.lastElementChild.remove();
   }

@@ -15,6 +15,8 @@ from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.identification.solution import FeatureReport, Reason, Solution
 
+pytestmark = pytest.mark.lowest("opencv")
+
 CAMERA = Camera.from_fov(20.0, 200, 100)
 POINTING = Attitude.from_radec_roll(80.0, 10.0, 0.0)
 

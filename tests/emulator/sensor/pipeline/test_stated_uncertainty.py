@@ -18,6 +18,8 @@ from starhil.emulator.sensor.pipeline.messages import FrameResult
 from starid.attitude import ARCSEC_PER_RAD, Attitude
 from starid.identification.solution import Solution
 
+pytestmark = pytest.mark.long
+
 SIGMAS = 4.0
 """Tolerance in standard deviations of the mean."""
 

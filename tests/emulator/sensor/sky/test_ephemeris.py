@@ -24,6 +24,8 @@ from starid.catalog import load_catalog
 from starid.catalog.aberration import aberrated
 from starid.catalog.earth import earth_and_sun, earth_velocity, in_metres, terrestrial_time, unix_time
 
+pytestmark = pytest.mark.lowest("pyerfa")
+
 NEW_YEAR = unix_time("2026-01-01")
 BY_DATE = Sky({"bodies": "ephemeris"})
 ARCSEC = math.radians(1.0 / 3600.0)

@@ -25,6 +25,8 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
 from starid.imaging.detection import detect
 
+pytestmark = pytest.mark.lowest("pyerfa")
+
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from starhil.emulator.sensor.sky.radiation import anomaly_share, particle_rate, sub_satellite_point
 
+pytestmark = pytest.mark.lowest("pyerfa")
+
 NOON_2026_UNIX_S = 1_767_268_800.0
 NOON_2026_JD = 2_461_042.0
 DISTANCE_M = 6.871e6

@@ -17,6 +17,8 @@ from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.imaging.detection import detect
 
+pytestmark = pytest.mark.lowest("pyerfa")
+
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 CAMERA = Camera.from_fov(42.0, width=937, height=937)
 SENSOR = SensorModel()

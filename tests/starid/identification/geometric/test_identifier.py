@@ -14,6 +14,8 @@ from starid.lab.leaderboard.comparison import ROWS, STANDARD, best_attitude
 from starid.lab.leaderboard.scenes import SceneSettings
 from tests.starid.identification.geometric.sky_points import WRONG_ARCSEC, identifier, maker, scenes
 
+pytestmark = pytest.mark.lowest("numba")
+
 FRAMES = 40
 FLOOR_RATIO = 1.1
 UNLIKELY = 1e-5

@@ -10,6 +10,8 @@ from starid.camera import Camera
 from starid.identification.geometric.identifier import Identifier, scaled_camera
 from tests.starid.identification.geometric.sky_points import identifier, sky
 
+pytestmark = pytest.mark.long
+
 RIGHT_ARCSEC = 60.0
 PLACES = [
     (ra, dec, roll)

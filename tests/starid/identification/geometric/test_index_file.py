@@ -19,6 +19,8 @@ from starid.identification.geometric.index_choice import index_settings, obtain_
 from starid.identification.geometric.pattern_index import resolved_stars
 from tests.starid.identification.geometric.sky_points import sky
 
+pytestmark = pytest.mark.long
+
 CAMERA = Camera.from_fov(60.0, 512, 512)
 MAX_BYTES = 10_000_000
 

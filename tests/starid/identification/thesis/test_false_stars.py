@@ -21,6 +21,8 @@ from starid.identification.thesis.metrics import Confusion
 from starid.identification.thesis.scalable_filter import TrackFilter, TrackFilterSettings
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, moved_frames, turned
 
+pytestmark = pytest.mark.long
+
 RADIUS = 21.0
 
 

@@ -20,6 +20,8 @@ from starid.identification.thesis.frame_grid import (
 )
 from tests.starid.identification.thesis.thesis_sky import database, thesis_catalog
 
+pytestmark = pytest.mark.long
+
 CODE_STEP = 100.0 / CODE_MAX
 HALF_A_CODE = 0.5 * CODE_STEP * (1.0 + 1e-9)
 

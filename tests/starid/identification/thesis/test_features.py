@@ -14,6 +14,8 @@ from starid.identification.thesis.database import DatabaseParameters, sky_of
 from starid.identification.thesis.features import FeatureError, extract_features
 from tests.starid.identification.thesis.thesis_sky import thesis_catalog
 
+pytestmark = pytest.mark.long
+
 PRINTED = 0.005
 """The published numbers have two decimals."""
 

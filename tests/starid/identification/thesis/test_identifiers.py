@@ -23,6 +23,8 @@ from starid.identification.thesis.lsi_identifier import LsiIdentifier
 from starid.identification.thesis.rsi_identifier import RsiIdentifier
 from starid.identification.tracker import Tracker
 
+pytestmark = pytest.mark.long
+
 RIGHT_ARCSEC = 120.0
 CHANCE = 1e-3
 """Probability with which a count may fall short of a share by chance."""

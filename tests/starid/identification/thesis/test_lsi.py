@@ -19,6 +19,8 @@ from starid.identification.thesis.subcell import SubcellSearch
 from starid.lab.simulation import turned
 from tests.starid.identification.thesis.thesis_sky import database, lost_in_space, thesis_frames
 
+pytestmark = pytest.mark.long
+
 GRID_STEP = 0.2
 
 

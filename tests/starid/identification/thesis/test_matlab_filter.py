@@ -12,6 +12,8 @@ from starid.identification.thesis.matlab_filter import MatlabFilter, affine_inli
 from starid.identification.thesis.metrics import Confusion
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, moved_frames, turned
 
+pytestmark = pytest.mark.long
+
 MAGNITUDES = np.array([0.5, 2.91, 1.93, 2.85, 1.58, 0.46, 1.29])
 POSITIONS = np.array(
     [[-19.6, -4.7], [-12.7, 10.4], [-9.0, 4.3], [3.4, -3.9], [5.2, 19.8], [6.4, -6.9], [7.9, 15.9]]

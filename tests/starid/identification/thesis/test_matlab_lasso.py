@@ -16,6 +16,8 @@ from starid.identification.thesis.matlab_lasso import matlab_path
 from starid.identification.thesis.metrics import boresight_error
 from tests.starid.identification.thesis.thesis_sky import database, thesis_catalog, thesis_frames
 
+pytestmark = pytest.mark.long
+
 CELLS = (509, 510, 511, 734, 735, 736, 959, 960, 961)
 OMEGA_MSE = (0, 0, 0.04, 0, 0.45, 0.26, 0, 0.26, 0)
 OMEGA_1SE = (0, 0, 0.03, 0, 0.44, 0.26, 0, 0.27, 0)

@@ -16,6 +16,8 @@ from starid.identification.thesis.missing_stars import DividedField, restore_mis
 from starid.lab.simulation import turned
 from tests.starid.identification.thesis.thesis_sky import lost_in_space, thesis_catalog
 
+pytestmark = pytest.mark.long
+
 RADIUS = 20.0
 
 

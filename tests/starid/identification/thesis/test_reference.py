@@ -15,6 +15,8 @@ from starid.identification.thesis.reference import ReferenceFilter, ReferenceLos
 from starid.lab.simulation import NoiseModel, moved_frames
 from tests.starid.identification.thesis.thesis_sky import database, lost_in_space
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("scikit-learn")]
+
 STARS = np.array(
     [[-19.6, -4.7], [-12.7, 10.4], [-9.0, 4.3], [3.4, -3.9], [5.2, 19.8], [6.4, -6.9], [7.9, 15.9]]
 )

@@ -23,6 +23,8 @@ from starid.identification.thesis.scalable_filter import TrackFilter, TrackFilte
 from starid.lab.simulation import NoiseModel, add_noise, sky_sequence, turned
 from tests.starid.identification.thesis.thesis_sky import lost_in_space
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("scipy")]
+
 
 def quiet_filter():
     return TrackFilter(TrackFilterSettings(0.002, 0.01, max_rotation_deg=4.0, max_shift_deg=4.0))

@@ -19,6 +19,8 @@ from starid.lab.classic.pairs import MAX_STARS, pair_table, pairs_within
 from starid.lab.classic.radial_dynamic_cyclic import likeness
 from starid.lab.classic.subgraph import simplest_size
 
+pytestmark = pytest.mark.long
+
 
 def sky(count: int, seed: int) -> np.ndarray:
     vectors = np.random.default_rng(seed).standard_normal((count, 3))

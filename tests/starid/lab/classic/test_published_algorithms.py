@@ -22,6 +22,8 @@ from starid.lab.classic.registry import CLASSICS, make_identifier
 from starid.lab.classic.solver import EVEN_PER_FIELD, ClassicIdentifier
 from starid.lab.leaderboard.scenes import SceneMaker, SceneSettings
 
+pytestmark = pytest.mark.long
+
 DEGREE_ARCSEC = 3600.0
 LIMIT = 5.5
 CAMERA = Camera.from_fov(42.0)

@@ -8,6 +8,8 @@ from starid.lab.experiments import registry, runner
 from starid.lab.experiments.classics_sky import thesis_sky
 from starid.lab.simulation import NoiseModel
 
+pytestmark = pytest.mark.long
+
 DEGREE = 1.0
 PIXEL = 42.0 / 937.0
 FRAMES = [(22.0, 12.0), (332.0, -38.0), (180.0, 62.0), (22.0, -68.0)]

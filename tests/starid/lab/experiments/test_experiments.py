@@ -49,6 +49,8 @@ from starid.lab.experiments.tables import (
     numbers_by_choice,
 )
 
+pytestmark = pytest.mark.long
+
 TIME_COLUMN = 6
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from starid.lab.experiments.figures import Curve, Panel, curves_of, draw, panels_of, precision
+
+pytestmark = pytest.mark.long
 
 
 def test_lines_of_a_table_become_a_curve_for_each_label():

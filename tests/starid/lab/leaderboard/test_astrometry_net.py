@@ -14,6 +14,8 @@ from starid.camera import Camera
 from starid.lab.leaderboard import astrometry_net
 from starid.lab.leaderboard.comparison import run
 
+pytestmark = pytest.mark.long
+
 CAMERA = Camera.from_fov(20.0, 512, 512)
 AT = Attitude.from_radec_roll(83.0, -5.0, 0.0)
 SCALE_DEG = math.degrees(1.0 / CAMERA.focal_px[0])

@@ -17,6 +17,8 @@ from starid.lab.leaderboard.comparison import ROWS, Tally, run
 from starid.lab.leaderboard.peers import Reply
 from starid.lab.leaderboard.scenes import Scene
 
+pytestmark = pytest.mark.long
+
 PROMISED = [
     "row", "solver", "frames", "valid_pct", "wrong", "boresight_median_arcsec", "floor_ratio", "median_ms", "p99_ms",
 ]  # fmt: skip

@@ -25,6 +25,8 @@ from starid.lab.leaderboard.peers import ALL, make_solver
 from starid.lab.leaderboard.report import markdown, ranked, right, write_leaderboard
 from starid.lab.leaderboard.scenes import SceneMaker, SceneSettings
 
+pytestmark = [pytest.mark.long, pytest.mark.lowest("matplotlib")]
+
 PIXEL = 1.0
 
 ORACLE = """

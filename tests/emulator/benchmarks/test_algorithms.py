@@ -1,0 +1,33 @@
+"""The comparison of algorithms on rendered images, with a part of the thesis's algorithms and without it."""
+
+import pytest
+
+from starhil.emulator.benchmarks.algorithms import AlgorithmPlan, Scene, run_algorithms
+
+IMAGES = 8
+
+
+@pytest.fixture(scope="module")
+def refined():
+    """The row of thesis and refinement by the part taken away."""
+
+    def row(part):
+        plan = AlgorithmPlan("ideal", IMAGES, 1, ("run.algorithm=rsi",), part)
+        rows = {row["algorithm"]: row for row in run_algorithms(plan, (Scene(0.3),))}
+        return rows["thesis + refinement"]
+
+    return {part: row(part) for part in (None, "region")}
+
+
+def test_a_slew_is_answered_from_the_region_unless_that_is_taken_away(refined):
+    assert refined[None]["in_region"] > 0
+    assert refined["region"]["in_region"] == 0
+    assert refined["region"]["triggers"] > 0
+
+
+def test_shares_are_of_all_images_and_one_sequence_has_no_standard_error(refined):
+    for row in refined.values():
+        assert row["frames"] == IMAGES
+        assert row["valid_pct"] == 100.0 * row["valid"] / IMAGES
+        assert row["right_pct"] == 100.0 * (row["valid"] - row["wrong"]) / IMAGES
+        assert row["valid_error_pct"] is None

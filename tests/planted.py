@@ -1,0 +1,135 @@
+"""Errors planted in the running product, so that whatever shares its code has them: a text in a module becomes another.
+
+The changed module is compiled, and its functions that exist get the new code, wherever they have been imported to; constants
+of the module are replaced in it. A text that is not there exactly once raises `LostAimError`: move the aim, do not drop the
+error.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import gc
+import importlib
+import sys
+import types
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+_CONSTANTS = (bool, int, float, str, bytes, tuple, frozenset, dict)
+
+
+class LostAimError(Exception):
+    """The function or the text that an error changes does not exist, or the text occurs several times."""
+
+
+@dataclass(frozen=True)
+class Edit:
+    """A change: in a module, by default of `starhil.protocol`, or in one function of it (`module:Class.function`), `before` becomes `after`.
+
+    Texts of several lines are indented as if the function began at the margin.
+    """
+
+    at: str
+    before: str
+    after: str
+
+
+@contextmanager
+def planted(*edits: Edit) -> Iterator[None]:
+    """Change the running product."""
+    by_module: defaultdict[str, list[Edit]] = defaultdict(list)
+    for edit in edits:
+        by_module[edit.at.partition(":")[0]].append(edit)
+    changes = [_changed(name, group) for name, group in by_module.items()]
+    with ExitStack() as stack:
+        for module, source in changes:
+            stack.enter_context(_exchanged(module, source))
+        _forget()
+        stack.callback(_forget)
+        yield
+
+
+def _changed(name: str, edits: Iterable[Edit]) -> tuple[types.ModuleType, str]:
+    """Return a module and its changed source."""
+    try:
+        module = importlib.import_module(name if name.startswith("starhil.") else f"starhil.protocol.{name}")
+    except ImportError as error:
+        raise LostAimError(f"{name}: {error}") from None
+    source = Path(str(module.__file__)).read_text(encoding="utf-8")
+    for edit in edits:
+        begin, end, indent = _part(source, edit)
+        before, after = (text.replace("\n", "\n" + indent) for text in (edit.before, edit.after))
+        found = source.count(before, begin, end)
+        if found != 1:
+            raise LostAimError(f"{edit.at}: {edit.before!r} occurs {found} times, must be once")
+        at = source.index(before, begin)
+        source = source[:at] + after + source[at + len(before) :]
+    return module, source
+
+
+def _part(source: str, edit: Edit) -> tuple[int, int, str]:
+    """Return where the text of the function of an edit begins and ends, and its indentation; without one, that of the module."""
+    path = edit.at.partition(":")[2]
+    if not path:
+        return 0, len(source), ""
+    node: ast.AST = ast.parse(source)
+    for part in path.split("."):
+        inner = [item for item in ast.iter_child_nodes(node) if getattr(item, "name", None) == part]
+        if not inner:
+            raise LostAimError(f"{edit.at}: no {part}")
+        node = inner[0]
+    lines = [0]
+    for line in source.splitlines(keepends=True):
+        lines.append(lines[-1] + len(line))
+    return lines[node.lineno - 1], lines[node.end_lineno], " " * node.col_offset  # type: ignore[attr-defined]
+
+
+@contextmanager
+def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
+    """Give the functions of a module, and its constants, what a changed source has."""
+    file = str(module.__file__)
+    compiled = compile(source, file, "exec")
+    new, old = (_by_name(code) for code in (compiled, compile(Path(file).read_text("utf-8"), file, "exec")))
+    fresh = {key: value for key, value in vars(module).items() if key.startswith("__")}
+    exec(compiled, fresh)
+    undo = ExitStack()
+    for function in [item for item in gc.get_objects() if type(item) is types.FunctionType]:
+        code = function.__code__
+        ours = function.__globals__ is vars(module) and code.co_filename == file  # not made by a decorator
+        if not ours or len(new[code.co_qualname]) != len(old[code.co_qualname]):
+            continue
+        nth = [each.co_firstlineno for each in old[code.co_qualname]].index(code.co_firstlineno)
+        if (changed := new[code.co_qualname][nth]).co_freevars == code.co_freevars:
+            function.__code__ = changed
+            undo.callback(setattr, function, "__code__", code)
+    for key, value in [*vars(module).items()]:
+        if type(value) in _CONSTANTS and key in fresh and fresh[key] != value and not key.startswith("__"):
+            setattr(module, key, fresh[key])
+            undo.callback(setattr, module, key, value)
+    with undo:
+        yield
+
+
+def _by_name(code: types.CodeType) -> defaultdict[str, list[types.CodeType]]:
+    """Return the code of functions by qualified name, those of the same name in the order of their lines."""
+    found: defaultdict[str, list[types.CodeType]] = defaultdict(list)
+    waiting = [code]
+    while waiting:
+        each = waiting.pop()
+        found[each.co_qualname].append(each)
+        waiting += [item for item in each.co_consts if isinstance(item, types.CodeType)]
+    for group in found.values():
+        group.sort(key=lambda item: item.co_firstlineno)
+    return found
+
+
+def _forget() -> None:
+    """Clear what the product has computed once, such as the definitions of units and tables of checks."""
+    modules = [module for name, module in sys.modules.items() if name.startswith("starhil.")]
+    for item in {id(item): item for module in modules for item in vars(module).values()}.values():
+        if isinstance(item, functools._lru_cache_wrapper):
+            item.cache_clear()
