@@ -152,21 +152,21 @@ class StoreRestore:
     def _store(self, subindex: int, data: bytes) -> Deferred | None:
         if data != SAVE:
             raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'save'")
-        deferred = self._apply(subindex, self._changed(), self._on_save)
+        deferred = self._apply(subindex, self._changed, self._on_save)
         self._context.report(EventKind.STORED, subindex)
         return deferred
 
     def _restore(self, subindex: int, data: bytes) -> Deferred | None:
         if data != LOAD:
             raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'load'")
-        deferred = self._apply(subindex, {}, self._on_restore)
+        deferred = self._apply(subindex, dict, self._on_restore)
         self._context.report(EventKind.RESTORED, subindex)
         return deferred
 
     def _apply(
-        self, subindex: int, values: Mapping[str, bytes], application: ApplicationStore | None
+        self, subindex: int, values: Callable[[], Mapping[str, bytes]], application: ApplicationStore | None
     ) -> Deferred | None:
-        """Write the parameters of a sub-index, those of the application last."""
+        """Write the parameters of a sub-index, those of the application last; `values` are only collected if they are written."""
         follows = application if subindex in {ALL, APPLICATION_ONLY} else None
         if subindex == APPLICATION_ONLY:
             return None if follows is None else follows()
@@ -180,7 +180,7 @@ class StoreRestore:
             if write.answers is not None:
                 self._finish(write.answers, write.refusal)
 
-        self._write(COMMUNICATION, values, ended)
+        self._write(COMMUNICATION, values(), ended)
         if write.refusal is not None:
             raise write.refusal
         deferred = None if follows is None else follows()

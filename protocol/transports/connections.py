@@ -11,7 +11,7 @@ import logging
 import resource
 import socket
 from abc import abstractmethod
-from typing import ClassVar, Final, cast
+from typing import Final, cast
 
 log: Final = logging.getLogger("starhil.connections")
 
@@ -69,7 +69,7 @@ class ConnectionLimit:
 class TurnProtocol(asyncio.BufferedProtocol):
     """A connection that reads at most `read_size` bytes before the loop serves other connections."""
 
-    read_size: ClassVar[int] = TURN
+    read_size: int = TURN
     _buffer: bytearray
 
     def get_buffer(self, sizehint: int) -> bytearray:  # noqa: ARG002 (asyncio's signature)

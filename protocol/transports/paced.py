@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import termios
+import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterator
@@ -20,6 +21,12 @@ BACKLOG_LIMIT: Final = 64 * 1024
 READ_SIZE: Final = 256
 """Maximum number of bytes that a port reads per turn of the loop: 80 faults or 50 requests, some 5 ms of work for a
 device; at 921 600 baud they arrive in 3 ms."""
+
+SMALLEST_READ: Final = 8
+"""Fewest bytes that a port reads per turn when they are much work, as lines of one byte are."""
+
+LONG_TURN_S: Final = 0.005
+"""Time that a turn takes if it was too much work: the next ones read half as much, seconds."""
 
 GRAIN_S: Final = 1e-6
 """A timer may fire this much early."""
@@ -62,6 +69,8 @@ class PacedTransport(SerialTransport):
         self._idle.set()
         self._next_baud: int | None = None
         """Bit rate from the end of the queue on."""
+        self.read_size = READ_SIZE
+        """Number of bytes that are read per turn of the loop."""
 
     @abstractmethod
     def _has_peer(self) -> bool:
@@ -153,7 +162,12 @@ class PacedTransport(SerialTransport):
 
     def _process_received(self, data: bytes) -> None:
         self.statistics.received += len(data)
+        begin_s = time.monotonic()
         self._receive(data)
+        too_long = time.monotonic() - begin_s > LONG_TURN_S
+        self.read_size = (
+            max(SMALLEST_READ, self.read_size // 2) if too_long else min(READ_SIZE, 2 * self.read_size)
+        )
 
 
 def write_fd(fd: int, data: bytes) -> int:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Final
 
 from starhil.protocol.transports.base import TransportError
-from starhil.protocol.transports.paced import READ_SIZE, PacedTransport, termios_as_os_error, write_fd
+from starhil.protocol.transports.paced import PacedTransport, termios_as_os_error, write_fd
 
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _IN_CLOSE: Final = 0x08 | 0x10
@@ -186,7 +186,7 @@ class PtyTransport(PacedTransport):
             return
         self._drop_unread(self._peers)
         try:
-            data = os.read(self._master, READ_SIZE)
+            data = os.read(self._master, self.read_size)
         except BlockingIOError:
             return
         except OSError as error:

@@ -17,7 +17,6 @@ from starhil.protocol.errors import reason
 from starhil.protocol.transports.base import ReconnectingTransport, TransportError
 from starhil.protocol.transports.connections import TurnProtocol, detect_lost_peer
 from starhil.protocol.transports.paced import (
-    READ_SIZE,
     PacedTransport,
     SerialTransport,
     termios_as_os_error,
@@ -113,7 +112,7 @@ class TtyTransport(PacedTransport, ReconnectingTransport[bytes]):
         if self._port is None:
             return
         try:
-            data = os.read(self._port.fileno(), READ_SIZE)
+            data = os.read(self._port.fileno(), self.read_size)
         except BlockingIOError:
             return
         except OSError as error:
@@ -189,7 +188,6 @@ class _TcpTransport(TurnProtocol, PacedTransport, ReconnectingTransport[bytes]):
     """A TCP connection; the protocol of its connection, of which there is one at a time."""
 
     kind = "serial"
-    read_size = READ_SIZE
     scheme: ClassVar[str]
 
     def __init__(self, host: str, port: int, pace: int | None) -> None:

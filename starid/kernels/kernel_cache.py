@@ -36,6 +36,8 @@ _VERSIONS: Final = ("numba", "numpy")
 _CHECKSUMS: Final = "checksums.json"
 _PATIENCE_S: Final = 5.0
 """Longest time for which a process waits until another one has recorded its checksums, seconds."""
+_ROOM_BYTES: Final = 40_000_000
+"""Free space with which kernels are cached: they take 15 MB, and are written beside the old ones."""
 _UNFINISHED_S: Final = 3600.0
 """Time after which a file without a checksum was left by a process that did not end properly, seconds."""
 
@@ -52,6 +54,9 @@ def use_kernel_cache() -> bool:
     key = sources_key()
     folder = kernel_folder(key)
     try:
+        if folder is not None and not _has_room(folder) and not (folder / _CHECKSUMS).exists():
+            _log.warning("%s: no room on the disk for kernels, so that each process compiles them", folder)
+            return False
         if folder is None or (folder.exists() and not os.access(folder, os.W_OK | os.X_OK)):
             folder = _temporary_copy(folder or cache_dir() / key)
         else:
@@ -67,6 +72,12 @@ def use_kernel_cache() -> bool:
     if "numba" in sys.modules:  # which has read its environment already
         sys.modules["numba"].config.CACHE_DIR = str(folder)
     return True
+
+
+def _has_room(folder: Path) -> bool:
+    """Return whether the disk of a folder, which need not exist, has room for all kernels: numba fails where it has not."""
+    nearest = next(each for each in (folder, *folder.parents) if each.exists())
+    return shutil.disk_usage(nearest).free >= _ROOM_BYTES
 
 
 def nothing_compiled() -> bool:

@@ -175,6 +175,17 @@ def test_a_slow_disk_delays_only_the_answer_to_the_store(new_bench):
     assert answers(bench) == [STORED]
 
 
+def test_what_is_stored_is_collected_only_when_it_is_written(new_bench, monkeypatch):
+    """A flood of stores collected the values of all objects for each, and slowed replies from 4 to 48 ms."""
+    disk = SlowDisk()
+    bench = new_bench(background=disk).power_on()
+    collected = Mock(return_value={})
+    monkeypatch.setattr(bench.slave.store, "_changed", collected)
+    for _ in range(10):
+        bench.sdo(STORE_ALL)
+    assert collected.call_count == 1
+
+
 def test_an_error_of_a_slow_disk_is_an_abort_and_the_old_values_remain(new_bench):
     disk, storage = SlowDisk(), ParameterStorage()
     storage.save = Mock(side_effect=StorageError("disk full"))

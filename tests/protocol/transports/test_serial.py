@@ -6,6 +6,7 @@ import asyncio
 import errno
 import os
 import termios
+import time
 import tty
 from pathlib import Path
 from typing import NoReturn
@@ -15,7 +16,7 @@ import serial
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import TransportError
-from starhil.protocol.transports.paced import BACKLOG_LIMIT, PacedTransport
+from starhil.protocol.transports.paced import BACKLOG_LIMIT, LONG_TURN_S, PacedTransport
 from starhil.protocol.transports.serial import open_serial
 from tests.conformance.simulated import SimulatedLoop
 from tests.protocol.transports.pairs import SERIAL_KINDS, serial_pair
@@ -493,5 +494,36 @@ def test_without_pacing_a_message_is_written_at_once_at_any_bit_rate() -> None:
         assert await asyncio.wait_for(reader.readexactly(3000), PATIENCE_S) == bytes(3000)
         writer.close()
         await one.close()
+
+    asyncio.run(main())
+
+
+def test_what_is_much_work_is_read_in_smaller_parts() -> None:
+    """A flood of lines of one byte held up the loop by 100 ms in each turn."""
+
+    async def main() -> None:
+        master, slave = os.openpty()
+        tty.setraw(slave)
+        sizes: list[int] = []
+        much = [True]
+
+        def work(data: bytes) -> None:
+            sizes.append(len(data))
+            if much:
+                time.sleep(len(data) * LONG_TURN_S / 50)
+
+        transport = open_serial(os.ttyname(slave), 921_600)
+        await transport.start(work)
+        os.write(master, bytes(2000))
+        await until(lambda: sum(sizes) >= 2000)
+        assert sizes[0] > 100 >= max(sizes[4:])
+        sizes.clear()
+        much.clear()
+        os.write(master, bytes(2000))
+        await until(lambda: sum(sizes) >= 2000)
+        assert max(sizes) > 100
+        await transport.close()
+        os.close(master)
+        os.close(slave)
 
     asyncio.run(main())

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -237,6 +238,22 @@ def test_processes_that_start_together_on_an_empty_cache_all_get_the_result(tmp_
     ended = [each.communicate(timeout=PATIENCE_S) for each in started]
     assert [(out.split()[0], errors) for out, errors in ended] == [("2.5", "")] * 3
     assert run(tmp_path) == ["2.5", "1"]
+
+
+def test_nothing_is_cached_on_a_disk_without_room_unless_all_is_cached_already(
+    cache_folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The start of a run ended with a traceback of numba, which could not write."""
+    monkeypatch.setattr(kernel_cache, "sources_key", lambda: "0123456789abcdef")
+    monkeypatch.setattr(kernel_cache.atexit, "register", lambda *_arguments: None)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "unchanged")
+    monkeypatch.setattr(kernel_cache.shutil, "disk_usage", lambda _path: SimpleNamespace(free=1_000_000))
+    assert not kernel_cache.use_kernel_cache()
+    assert "no room on the disk for kernels" in caplog.text
+    folder = cache_folder / "kernels" / "0123456789abcdef"
+    folder.mkdir(parents=True)
+    (folder / "checksums.json").write_text("{}")
+    assert kernel_cache.use_kernel_cache()
 
 
 def test_kernels_run_where_the_cache_cannot_be_written_and_a_line_says_so(
