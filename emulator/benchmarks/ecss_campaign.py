@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, ClassVar, Final
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from starhil.emulator.sensor.pipeline.messages import (
     camera_constants,
 )
 from starhil.emulator.sensor.pipeline.pipeline import Pipeline
+from starhil.emulator.sensor.sky.view import BodySource
 from starhil.emulator.sensor.star_count import few_stars
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.unit import load_unit
@@ -154,13 +155,15 @@ class _FrameConditions:
 class EcssDevice:
     """The image pipeline of a profile's device, with the device's parameters and temperatures in flight."""
 
+    BODIES: ClassVar[BodySource] = "typed"
+    """Without a date in its request a frame has no aberration, and bodies only where a condition puts them."""
+
     def __init__(self, plan: EcssPlan) -> None:
         self.plan = plan
         profile = load_profile(plan.profile, [*plan.overrides, "run.clock=stepped", f"run.seed={plan.seed}"])
         icd = load_unit(profile.unit_source)
         setup = pipeline_setup(profile)
-        # without a date in its request a frame has no aberration, and bodies only where a condition puts them
-        sky = {**setup.sky, "bodies": "typed", "aberration": True}
+        sky = {**setup.sky, "bodies": self.BODIES, "aberration": True}
         self.pipeline = Pipeline(replace(setup, sky=sky))
         self.start_unix_s, self.orbit = profile.start_unix_s, orbit_of(profile)
         parameters = self.parameters = Parameters(icd, profile_defaults(profile, icd))

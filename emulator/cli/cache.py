@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starhil.emulator.cli.options import ProfileArgument, names_of
+from starhil.emulator.cli.options import OrbitChoice, ProfileArgument, names_of, with_orbit
 from starhil.emulator.cli.output import report_slow_start
 from starid.cli.options import AsJson
 
@@ -57,6 +57,7 @@ def info(as_json: AsJson = False) -> None:
 @group.command("warm")
 def warm(
     profile: ProfileArgument = None,
+    orbit: OrbitChoice = None,
     unit: Annotated[
         str | None,
         typer.Option(
@@ -87,7 +88,9 @@ def warm(
         "links.canopen.node=0",
     ]
     profiles = [
-        load_profile(name, [*fixed, "run.state_dir=", *([] if of is None else [f"unit={of}"])])
+        load_profile(
+            name, with_orbit([*fixed, "run.state_dir=", *([] if of is None else [f"unit={of}"])], orbit)
+        )
         for name, of in targets
     ]
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from starhil.emulator.benchmarks.campaign import CampaignPlan
     from starhil.emulator.benchmarks.ecss_campaign import EcssPlan
 
-_WITH_PROFILE: Final = ("frames", "seed", "profile", "setting")
+_WITH_PROFILE: Final = ("frames", "seed", "profile", "orbit", "setting")
 """Options of a lost-in-space campaign that hold for a profile, too."""
 
 WORKERS_S: Final = 60
@@ -62,6 +62,12 @@ _ALGORITHM_COLUMNS: Final[tuple[Column, ...]] = (
     ("ms", _number("median_ms", 2)),
     ("p99 ms", _number("p99_ms", 1)),
     ("kB", _number("kilobytes", 0)),
+)
+
+_ORBIT_COLUMNS: Final[tuple[Column, ...]] = (
+    ("attitude, or cause of none", lambda row: row["cause"]),
+    ("images", lambda row: str(row["frames"])),
+    ("%", lambda row: f"{row['share_pct']:.1f}"),
 )
 
 group = typer.Typer(
@@ -210,6 +216,7 @@ class PlanOptions:
             autocompletion=names_of("profile"),
         ),
     ] = None
+    orbit: OrbitChoice = None
     setting: Settings = None
     fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0
     unknown_field: Annotated[
@@ -241,14 +248,19 @@ class PlanOptions:
         from starhil.emulator.benchmarks.ecss_campaign import EcssPlan
 
         if self.profile is None:
-            if self.setting:
-                raise typer.BadParameter("--set overrides a key of --profile; give one")
+            if self.setting or self.orbit is not None:
+                raise typer.BadParameter("--set and --orbit change the profile given by --profile; give both")
             return None
         for item in fields(self):
             if item.name not in _WITH_PROFILE and getattr(self, item.name) != item.default:
                 option = f"--{item.name.replace('_', '-')}"
                 raise typer.BadParameter(f"{option} and --profile exclude each other; use --set")
-        return EcssPlan(self.profile, tuple(self.setting or ()), self.seed, rest_frames=self.frames)
+        return EcssPlan(
+            self.profile,
+            tuple(with_orbit(self.setting, self.orbit)),
+            self.seed,
+            rest_frames=self.frames,
+        )
 
     def plan(self) -> CampaignPlan:
         """Return the plan."""
@@ -366,6 +378,45 @@ def algorithms(
     else:
         print_table(_ALGORITHM_COLUMNS, rows)
     if any(row["wrong"] for row in rows if row["algorithm"] != "thesis"):
+        raise typer.Exit(1)
+
+
+@group.command("orbit")
+def orbit_campaign(
+    *,
+    profile: Annotated[
+        str, typer.Option(help="Device profile: a name or a TOML file.", autocompletion=names_of("profile"))
+    ] = "cubestar",
+    orbit: Annotated[
+        str, typer.Option("--orbit", help="Orbit: leo, or a TOML file.", autocompletion=names_of("orbit"))
+    ] = "leo",
+    setting: Settings = None,
+    frames: Annotated[int, typer.Option(min=1, help="Number of images, evenly spread over the time.")] = 1000,
+    days: Annotated[float, typer.Option(min=1e-3, max=1000.0, help="Time along the orbit, days.")] = 1.0,
+    pointing: Annotated[
+        str,
+        typer.Option(
+            help="zenith: away from the Earth, turning with the orbit; random: at rest in random directions."
+        ),
+    ] = "zenith",
+    seed: Seed = 1,
+    jobs: Jobs = 1,
+    as_json: AsJson = False,
+) -> None:
+    """Count what costs a device in orbit how many images: Sun, Moon, Earth, particles, rate, temperature.
+
+    Each image is solved lost in space. One without a right attitude is solved again without one of these after the
+    other; those that spare it are its cause. The exit status is 1 if any attitude is wrong.
+    """
+    from starhil.emulator.benchmarks.orbit_campaign import OrbitPlan, run_orbit, summarise
+
+    plan = OrbitPlan(profile, tuple(with_orbit(setting, orbit)), seed, frames, days, pointing)
+    rows = summarise(list(_with_progress(run_orbit(plan, jobs=jobs), plan.chunks)))
+    if as_json:
+        print(json.dumps(rows))
+    else:
+        print_table(_ORBIT_COLUMNS, rows)
+    if any(row["frames"] for row in rows if row["cause"] == "wrong"):
         raise typer.Exit(1)
 
 

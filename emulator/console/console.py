@@ -33,6 +33,7 @@ from starhil.emulator.simulation.guard import log_internal_error
 from starhil.emulator.simulation.threads import in_thread
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starid.errors import StaridError
 
@@ -112,6 +113,11 @@ class Console:
             "note": self._note,
             "message": self._message,
         }
+
+    @property
+    def icd(self) -> InterfaceDefinition:
+        """Interface definition of the unit."""
+        return self._head.icd
 
     def start(self) -> None:
         """Start listening."""

@@ -29,6 +29,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth.json_lines import JsonError, parse_object
 from starhil.protocol.errors import escape_controls, reason
+from starhil.protocol.export import export
 from starhil.protocol.transports.connections import WINDOW, ConnectionLimit, detect_lost_peer
 
 log = logging.getLogger("starhil.console")
@@ -130,6 +131,7 @@ class ConsoleServer:
         app.router.add_get("/wire.txt", self._wire_text)
         app.router.add_get("/wire.pcapng", self._wire_pcapng)
         app.router.add_get("/record.mcap", self._record)
+        app.router.add_get("/docs/icd", self._interface)
         app.router.add_get("/docs/{page}", _docs)
         app.router.add_post("/runs", self._report)
         app.router.add_get("/static/{path:.*}", self._static)
@@ -237,6 +239,11 @@ class ConsoleServer:
     async def _session(self, request: web.Request) -> web.Response:
         text = self._console(request).obc.session("Recorded in the console")
         return _download(text, "session.toml", "application/toml")
+
+    async def _interface(self, request: web.Request) -> web.Response:
+        """Return the interface definition of the unit that runs, in Markdown."""
+        text = await in_thread(export, self._console(request).icd, "markdown")
+        return web.Response(text=text, content_type="text/plain", charset="utf-8")
 
     async def _wire_log(self, request: web.Request) -> web.Response:
         trace = self._console(request).trace

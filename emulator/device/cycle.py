@@ -125,6 +125,8 @@ class FrameCycle:
         """What is to be done in the next exposure, and in which phase."""
         self.upsets: tuple[CatalogUpset, ...] = ()
         """Bits flipped in the star catalogue since start-up."""
+        self._stored_upsets: tuple[CatalogUpset, ...] = ()
+        """Those flipped where the catalogue is stored, which a restart does not undo."""
         self.index = 0
         """Index of the next exposure; never reset, so that no two exposures have the same noise."""
         self.published = 0
@@ -176,7 +178,7 @@ class FrameCycle:
         self.stop()
         self._history.clear()
         self.published = self.skipped = 0
-        self.upsets = ()
+        self.upsets = self._stored_upsets
 
     def at_phase(self, phase: Phase, action: Action) -> None:
         """Do something once, at a phase of the next exposure that begins."""
@@ -189,13 +191,15 @@ class FrameCycle:
             start_ns = max(self._now_ns(), min(self._next.due_ns, self._grid_ns + self._period_ns()))
             self._next = self._scheduler.at(start_ns, self._start_exposure)
 
-    def upset_catalog(self, upset: CatalogUpset) -> None:
-        """Flip a bit in the star catalogue."""
+    def upset_catalog(self, upset: CatalogUpset, *, stored: bool = False) -> None:
+        """Flip a bit in the star catalogue, or where it is stored."""
         self.upsets += (upset,)
+        if stored:
+            self._stored_upsets += (upset,)
 
     def restore_catalog(self) -> None:
         """Undo the flipped bits of the star catalogue."""
-        self.upsets = ()
+        self.upsets = self._stored_upsets = ()
 
     def has_fix(self, within_s: float) -> bool:
         """Return whether there is an attitude not older than `within_s`."""

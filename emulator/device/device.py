@@ -275,10 +275,17 @@ class Device:
         """Set all parameters to their stored values, or to their defaults if none are stored."""
         self.parameters.restore(self._stored_parameters)
 
-    def upset_parameter(self, name: str, bit: int) -> None:
-        """Flip a bit of a parameter in memory; enter the error mode if the result is invalid."""
-        log.warning("bit %d of the parameter %s flipped", bit, name)
-        if not self.parameters.flip_bit(name, bit):
+    def upset_parameter(self, name: str, bit: int, *, stored: bool = False) -> None:
+        """Flip a bit of a parameter in memory; enter the error mode if the result is invalid.
+
+        A `stored` one is flipped where it is saved: it changes at the next restart, unless it is invalid and ignored then.
+        """
+        log.warning("bit %d of the %sparameter %s flipped", bit, "stored " if stored else "", name)
+        if stored:
+            flipped = self.parameters.flip_stored(name, bit)
+            self._stored_parameters = {**self._stored_parameters, name: flipped}
+            self._persist()
+        elif not self.parameters.flip_bit(name, bit):
             self.modes.fail("parameter_store")
 
     def _persist(self) -> PendingAnswer[EmulatorError | None]:

@@ -158,6 +158,18 @@ class Parameters(Mapping[str, ParameterValue]):
             return False
         return True
 
+    def flip_stored(self, name: str, bit: int) -> ParameterValue | None:
+        """Flip a bit of a stored value, or of the default if none is stored; return the result, None if it is invalid."""
+        definition, stored = self._definitions[name], self.state.stored
+        value = definition.to_number(stored.get(name, self.state.defaults[name]))
+        try:
+            flipped = definition.check(flipped_number(value, memory_format(definition), bit))
+        except MessageError:
+            self.mark_stored({key: kept for key, kept in stored.items() if key != name})
+            return None
+        self.mark_stored({**stored, name: flipped})
+        return flipped
+
     def set_defaults(self) -> None:
         """Set all parameters to their defaults."""
         self._assign(self.state.defaults)

@@ -40,6 +40,9 @@ class UpsetFault(Strict):
     """Component of the star's direction: 0, 1 or 2 for x, y or z."""
     bit: Annotated[int, Field(ge=0, le=63)]
     """Bit number, 0 for the least significant; components of directions have 32 bits."""
+    stored: bool = False
+    """Flip it in the memory that survives a restart. A parameter then changes at the next restart, until parameters are saved or
+    the saved ones deleted; a star changes at once, until all faults are ended."""
 
     @model_validator(mode="after")
     def _one_target(self) -> Self:
@@ -81,9 +84,9 @@ def _stick(device: Device, stuck: bool) -> None:
 
 def _upset(device: Device, upset: UpsetFault) -> None:
     if upset.parameter is not None:
-        device.upset_parameter(upset.parameter, upset.bit)
+        device.upset_parameter(upset.parameter, upset.bit, stored=upset.stored)
     elif upset.star is not None:
-        device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
+        device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit), stored=upset.stored)
 
 
 def _upset_stars(device: Device) -> dict[str, Any]:
@@ -141,7 +144,7 @@ class DeviceFault(Strict):
             ends_at_restart=True,
         ),
     ] = None
-    """Flip a bit in memory; undone by a restart or by restoring the parameters."""
+    """Flip a bit in memory; undone by a restart or by restoring the parameters, unless it is `stored`."""
 
 
 EFFECTS: Final[Mapping[str, Effect]] = {
@@ -255,7 +258,7 @@ class Faults:
     def clear(self) -> None:
         """End all faults, and those that wait for their phase.
 
-        The error mode ends only by telecommand, and flipped parameters by a restart.
+        The error mode ends only by telecommand, and flipped parameters by a restart or as `UpsetFault.stored` says.
         """
         self._cleared += 1
         device = self._device

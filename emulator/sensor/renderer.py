@@ -18,6 +18,7 @@ from starhil.emulator.sensor.particle_hits import add_protons
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.rolling_shutter import at_row_times
 from starhil.emulator.sensor.sky.area_light import AreaLight, Backdrop
+from starhil.emulator.sensor.sky.catalog_errors import as_in_the_sky
 from starhil.emulator.sensor.sky.ephemeris import Observer
 from starhil.emulator.sensor.sky.light import AreaPainter
 from starhil.emulator.sensor.sky.objects import PointSource, SkyObjects
@@ -27,6 +28,7 @@ from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.catalog.catalog import companions
 from starid.catalog.photometry import flux_ratio
+from starid.catalog.variable_stars import BRIGHTEST, HIP, variable_magnitudes
 from starid.elementary import acos, cos, square
 from starid.matrices import length, lengths, product
 
@@ -38,11 +40,15 @@ _COMPANION_RAD: Final = math.radians(1.0)
 """Largest distance of a companion: with coarser pixels it would take minutes to find them all."""
 _COMPANION_PX: Final = 2.0
 _OBJECT_STREAM: Final = 2
+_CATALOG_STREAM: Final = 3
 _FLOOD_WELLS: Final = 10.0
 """Full wells of electrons in every pixel when light passes the baffle."""
 
 _GLARE_SHARE: Final = 0.05
 """Glare below which none is drawn, as a share of the read noise."""
+
+_LEAST_GHOST_E: Final = 1.0
+"""Electrons below which no ghost is drawn."""
 
 _CONE_MARGIN_RAD: Final = math.radians(1.0)
 
@@ -108,6 +114,14 @@ def _disturbed(
     return path, electrons
 
 
+def _ghosts(camera: Camera, path: Array, electrons: Array, share: float) -> tuple[Array, Array]:
+    """Return paths (m, 6) and electrons (m,) of the ghosts of stars, mirrored through the axis of the lens."""
+    bright = electrons * share > _LEAST_GHOST_E
+    ghosts = -path[bright]
+    ghosts[:, :2] += 2.0 * np.array(camera.centre_px)
+    return ghosts, share * electrons[bright]
+
+
 def frame_without_truth(image: GreyImage, frame_index: int) -> Frame:
     """Return the frame of an image (h, w) that was not rendered: it has no stars, and its attitude is the identity."""
     none = np.zeros(0)
@@ -142,13 +156,22 @@ class Renderer:
         colour = np.nan_to_num(catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
         brightness = np.asarray(catalog.v - self.sensor.colour_term * colour, dtype=np.float64)
         limit = self.sensor.limiting_magnitude
+        varying = np.flatnonzero(np.isin(catalog.hip, HIP[limit >= BRIGHTEST]))
         near = companions(catalog, limit, min(_COMPANION_PX * camera.pixel_scale_rad, _COMPANION_RAD))
-        rows = np.concatenate([np.flatnonzero(catalog.v <= limit), near])
+        rows = np.unique(np.concatenate([np.flatnonzero(catalog.v <= limit), near, varying]))
         self._rows = rows[np.argsort(brightness[rows], kind="stable")]
         self._vectors = np.ascontiguousarray(catalog.vectors[self._rows])
         parallax_mas = np.maximum(np.nan_to_num(catalog.parallax_mas[self._rows]), 0.0)
         self._parallax_rad = np.radians(parallax_mas / 3.6e6)
         self._flux_e_s = self.sensor.zero_magnitude_e_s * flux_ratio(brightness[self._rows])
+        hip = catalog.hip[self._rows]
+        number = np.flatnonzero(np.isin(HIP, hip))
+        where = np.array([np.flatnonzero(hip == each)[0] for each in HIP[number]], dtype=np.int64)
+        self._varying = number, where, catalog.v[self._rows[where]].astype(np.float64)
+        """Of the variable stars: their number in `VARIABLE_STARS`, their rows, and V in the catalogue."""
+        self._only_at_maximum = where[(self._varying[2] > limit) & ~np.isin(self._rows[where], near)]
+        """Rows of variable stars that are within the limit only at their maximum."""
+        self._sky_stars: tuple[tuple[object, ...], Array, Array] = ((), self._vectors, np.ones(0))
         self._cos_cone = cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
         pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
         self._pattern = _vignetted(pattern, camera, self.sensor.vignetting)
@@ -197,11 +220,14 @@ class Renderer:
         mean = self._mean_without_stars(exposure, temperature, area)
         self._pattern.telegraph.add(mean, index, exposure * sensor.dark_factor(temperature))
         planets = () if others is None else others.planets
-        path, sources, inside = self._paths(optical_axis, rate, exposure, observer, planets)
+        vectors, flux_e_s = self._as_in_the_sky(others, observer)
+        path, sources, inside = self._paths(
+            vectors, flux_e_s > 0.0, optical_axis, rate, exposure, observer, planets
+        )
         count = int(np.count_nonzero(sources < len(self._rows)))
         magnitudes = [planets[number - len(self._rows)].magnitude for number in sources[count:]]
         planets_e = [self.sensor.electrons(magnitude, exposure) for magnitude in magnitudes]
-        electrons = np.concatenate([self._flux_e_s[sources[:count]] * exposure, planets_e])
+        electrons = np.concatenate([flux_e_s[sources[:count]] * exposure, planets_e])
         drawn, lit, centred = electrons, path, np.flatnonzero(inside[:count])
         object_truth = None
         if others is not None:
@@ -215,6 +241,8 @@ class Renderer:
             rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
             false_xy = self._add_false_stars(mean, others, rng, exposure)
             lit, drawn = _disturbed(path, drawn, others, rng)
+            if others.ghost_share > 0.0:
+                self._add_light(mean, *_ghosts(self._optics, lit, drawn, others.ghost_share))
             particles = int(rng.poisson(others.cosmic_rays_s * exposure))
             tracks = add_protons(mean, particles, rng, sensor.epi_um, sensor.pixel_um)
             object_truth = ObjectTruth(false_xy, planet_xy, tracks, area.covered_share if area else 0.0)
@@ -280,8 +308,44 @@ class Renderer:
             area.draw(self._work, backdrop)
         return self._work
 
+    def _as_in_the_sky(self, objects: SkyObjects | None, observer: Observer | None) -> tuple[Array, Array]:
+        """Return directions (n, 3) and electrons/s (n,) of the stars.
+
+        They differ from the catalogue's by its errors, and at a date by the variable stars.
+        """
+        vectors, flux_e_s = self._with_catalog_errors(objects)
+        number, rows, in_catalog = self._varying
+        if not rows.size:
+            return vectors, flux_e_s
+        flux_e_s = flux_e_s.copy()
+        if observer is None:
+            flux_e_s[self._only_at_maximum] = 0.0
+        else:
+            fainter = variable_magnitudes(observer.unix_s)[number] - in_catalog
+            flux_e_s[rows] *= flux_ratio(fainter)
+        return vectors, flux_e_s
+
+    def _with_catalog_errors(self, objects: SkyObjects | None) -> tuple[Array, Array]:
+        """Return directions (n, 3) and electrons/s (n,) of the stars, with the catalogue's errors against the sky."""
+        if objects is None:
+            return self._vectors, self._flux_e_s
+        errors = (
+            objects.catalog_position_error_arcsec,
+            objects.catalog_magnitude_error,
+            objects.catalog_errors,
+        )
+        if not any(errors):
+            return self._vectors, self._flux_e_s
+        if self._sky_stars[0] != errors:
+            rng = np.random.default_rng((self.seed, _CATALOG_STREAM))
+            vectors, fainter = as_in_the_sky(self.catalog.hip[self._rows], self._vectors, *errors, rng)
+            self._sky_stars = errors, vectors, flux_ratio(fainter)
+        return self._sky_stars[1], self._flux_e_s * self._sky_stars[2]
+
     def _paths(
         self,
+        vectors: Array,
+        shine: Mask,
         attitude: Attitude,
         rate: Array,
         exposure_s: float,
@@ -290,14 +354,14 @@ class Renderer:
     ) -> tuple[Array, Indices, Mask]:
         """Return paths (n, 6), numbers and centre-inside mask of the stars and planets whose light may reach the image.
 
-        A path is the parabola through the projections at the start, middle and end of the exposure. The numbers of planets
-        follow those of the stars.
+        The stars are in directions `vectors` (k, 3), those that `shine`. A path is the parabola through the projections at the start,
+        middle and end of the exposure. The numbers of planets follow those of the stars.
         """
         readout_s = self.camera.height * self.sensor.row_time_s
         sweep = length(rate) * (exposure_s + readout_s)
         cosine = cos(min(acos(self._cos_cone) + sweep, math.pi))
-        near = np.flatnonzero(product(self._vectors, attitude.boresight) >= cosine)
-        icrs = self._vectors[near]
+        near = np.flatnonzero((product(vectors, attitude.boresight) >= cosine) & shine)
+        icrs = vectors[near]
         if observer is not None:
             icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
         if planets:

@@ -39,7 +39,7 @@ log = logging.getLogger("starhil.truth")
 AT_ONCE_BYTES: Final = 500_000
 """Size up to which a text is read in the process of the run, which takes a thread of it half a second."""
 
-LONGEST_S: Final = 900
+LONGEST_S: Final = 3600
 """Longest time for which a file is read, seconds: a meta-kernel may name a pipe, and truths wait for one another."""
 
 Kind: TypeAlias = Literal["truth", "orbit"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, TypeAlias
@@ -10,7 +11,7 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, Array32, GreyImage, Indices32, Mask, Records
+from starid.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask, Records
 from starid.elementary import square
 from starid.errors import StaridError
 from starid.imaging.background import Background, estimate_background
@@ -85,6 +86,18 @@ _TRAIL_ERROR: Final = 4e-4
 
 _CUT_TRAIL_ERROR: Final = 0.01
 """The same, also across, of a trail that the image's edge cuts off: its length and direction are known only from other stars."""
+
+
+_UNRESOLVED_SHARE: Final = 0.1
+"""Flux of a star on the trail of another, as a share of it, from which χ² of the fit shows it: it then stands seven sigmas out of
+the noise of the trail."""
+
+_DARK_SIGMA: Final = 6.0
+_DARK_PIXELS: Final = 3
+"""A window with this many pixels so far below the sky is cut by something dark; one or two may be dead."""
+
+_STEP_PER_SPREAD: Final = 1.349
+"""Height of a step, in standard deviations by quartiles of a ring that it divides in halves."""
 
 
 @dataclass(frozen=True)
@@ -324,11 +337,11 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
         return _no_detections(
             background, "image is flat: no light reaches it" if flat else "no star stands out of the noise"
         )
-    fits = _fit_candidates(scene, peaks, heights, shape)
+    fits = _fit_candidates(_without_weight(scene, hot), peaks, heights, shape)
     if unsure and fits.suspicious:
         shape = _trails_among_round(scene, peaks[: len(fits.stars)][fits.stars["state"] != FAINT], shape)
         if shape.trail_px > 0.0:
-            fits = _fit_candidates(scene, *_trail_peaks(scene, shape, hot), shape)
+            fits = _fit_candidates(_without_weight(scene, hot), *_trail_peaks(scene, shape, hot), shape)
     return _stars_of(scene, fits, shape, len(hot))
 
 
@@ -385,6 +398,16 @@ def _without_hot_pixels(
     sky_under_lone_pixels(scene.counts, peaks, *scene.grids, sky)
     hot = ~np.isnan(sky)
     return peaks[~hot], heights[~hot], np.column_stack([peaks[hot], sky[hot]])
+
+
+def _without_weight(scene: _Scene, hot: Table) -> _Scene:
+    """Return the scene in which hot pixels are saturated, so that they have no weight in the fits of stars beside them."""
+    if not len(hot):
+        return scene
+    counts = scene.counts.copy()
+    columns, rows = hot[:, :2].astype(np.int64).T
+    counts[rows, columns] = np.iinfo(counts.dtype).max
+    return dataclasses.replace(scene, counts=counts)
 
 
 def _trail_peaks(scene: _Scene, shape: SpotShape, hot: Table) -> tuple[Indices32, Grid]:
@@ -521,6 +544,49 @@ def _misfits(fits: Records) -> tuple[Array, Mask]:
     return misfit, misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom)
 
 
+def _shift_by_edge(scene: _Scene, fits: _Fits, good: Indices, sigma_px: float) -> Array:
+    """Return how far (n,) an edge in the background may have shifted the fits of the stars `good` (n,), pixels.
+
+    An edge, as of a body in front of the sky, is not noise: all pixels on one side of it pull the same way. A step of height h
+    through the middle of a spot shifts its fit by ``h ∫ M_x θ / (F ∫ M_x²)``, with the shape M and the flux F of the star: by
+    8 π σ³ h / (√(2π) F) for a round one, and by 2 π σ² L h / F along a trail of length L. There is a step where some pixels of
+    the window are darker than any sky, or where the ring around it varies more than noise and the light of the background
+    explain.
+    """
+    background, settings, windows = scene.background, scene.settings, fits.windows[good]
+    explained = np.full(len(windows), square(background.median_noise))
+    if settings.gain_e_per_dn is not None:
+        explained += np.maximum(windows["base"] - background.median_level, 0.0) / settings.gain_e_per_dn
+    rest = square(windows["noise"]) - explained
+    step = _STEP_PER_SPREAD * np.sqrt(np.where(rest > explained, rest, 0.0))
+    ends = windows["offset"] + windows["columns"] * windows["rows"]
+    for k, (begin, end, sky2) in enumerate(zip(windows["offset"], ends, explained, strict=True)):
+        pixels = fits.pixels[begin:end]
+        darkest = -float(np.partition(pixels, _DARK_PIXELS - 1)[_DARK_PIXELS - 1])
+        if darkest > _DARK_SIGMA * math.sqrt(sky2):
+            step[k] = max(step[k], darkest)
+    trail2 = square(windows["trail_x"]) + square(windows["trail_y"])
+    reach = np.sqrt(trail2 + square(4.0 / math.sqrt(2.0 * math.pi) * sigma_px))
+    flux = fits.stars["flux"][good]
+    return np.asarray(2.0 * math.pi * square(sigma_px) * reach * step / flux, dtype=np.float64)
+
+
+def _shift_by_hidden_stars(flux: Array, length: Array, sigma_px: float, size: tuple[int, int]) -> Array:
+    """Return how far (n, 2) fainter stars on the trails of stars shift their fits along and across the trail, rms, pixels.
+
+    A trail covers an area in which a fainter star is not resolved. One of flux f, displaced by l along and x across a trail of
+    length L and flux F, shifts its fit by ``f/F · √π s · exp(−x²/4s²)`` along it if l < L, and by ``f/F · (1 − l/L) · x ·
+    exp(−x²/4s²)`` across; s is the width of the spot, with the pixel's own. The mean squares, over stars as dense as those in the
+    image, are ``2 π √(2π) L s³`` and ``⅔ √(2π) L s³`` times Σ f²/(F² A), where the sum is over the stars of area A that are
+    faint enough.
+    """
+    width2 = square(sigma_px) + 1.0 / 12.0
+    fainter = np.where(flux[None, :] < _UNRESOLVED_SHARE * flux[:, None], flux[None, :], 0.0)
+    squares = np.sum(square(fainter), axis=1) / (square(flux) * size[0] * size[1])
+    both = math.sqrt(2.0 * math.pi * width2) * width2 * np.array([2.0 * math.pi, 2.0 / 3.0])
+    return np.asarray(np.sqrt((squares * length)[:, None] * both), dtype=np.float64)
+
+
 def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detections:
     """Keep the candidates that are stars; `hot` others were rejected before."""
     background, settings = scene.background, scene.settings
@@ -537,16 +603,24 @@ def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detecti
     for variance in ("var_x", "var_y", "cov_xy", "var_flux"):
         stars[variance] *= np.where(is_bad, misfit, 1.0)
     doubt_close_pairs(stars, np.argsort(-stars["y"], kind="stable"), settings.blend_px)
+    uneven = square(_shift_by_edge(scene, fits, good, shape.sigma_px))
+    stars["var_x"] += uneven
+    stars["var_y"] += uneven
     unit = 1.0 if settings.gain_e_per_dn is None else settings.gain_e_per_dn
     middle = np.column_stack([stars["x"], stars["y"]])
     if shape.trail_px > 0.0:
         size = (scene.counts.shape[1], scene.counts.shape[0])
         shifts, trails = trail_shifts(shape.flow, middle, size, shape.sigma_px, shape.trail_px)
         middle -= shifts
-        cut = square(np.where(marks & AT_EDGE, _CUT_TRAIL_ERROR, 0.0)) * np.sum(square(trails), axis=1)
-        stars["var_x"] += square(_TRAIL_ERROR * trails[:, 0]) + cut
-        stars["var_y"] += square(_TRAIL_ERROR * trails[:, 1]) + cut
-        stars["cov_xy"] += square(_TRAIL_ERROR) * trails[:, 0] * trails[:, 1]
+        length2 = np.sum(square(trails), axis=1)
+        cut = square(np.where(marks & AT_EDGE, _CUT_TRAIL_ERROR, 0.0)) * length2
+        hidden = square(_shift_by_hidden_stars(stars["flux"], np.sqrt(length2), shape.sigma_px, size))
+        # along and across: the same in all directions, and more along the trail
+        across = cut + hidden[:, 1]
+        more = square(_TRAIL_ERROR) + (hidden[:, 0] - hidden[:, 1]) / np.maximum(length2, 1.0)
+        stars["var_x"] += more * square(trails[:, 0]) + across
+        stars["var_y"] += more * square(trails[:, 1]) + across
+        stars["cov_xy"] += more * trails[:, 0] * trails[:, 1]
     sigmas = np.sqrt(np.column_stack([stars["var_x"], stars["var_y"]]))
     return Detections(
         middle,

@@ -114,6 +114,7 @@ def processors() -> dict[str, Processor]:
                 ("NUMBA_CPU_NAME", "generic"),
                 ("NPY_DISABLE_CPU_FEATURES", " ".join(dispatched)),
                 ("OPENBLAS_CORETYPE", "Prescott"),
+                ("GLIBC_TUNABLES", "glibc.cpu.hwcaps=-AVX512F,-AVX2,-FMA,-FMA4"),
             ),
         ),
         "haswell": Processor(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from functools import cached_property, lru_cache
 from typing import Final
@@ -29,7 +30,7 @@ from starhil.emulator.sensor.sky.objects import (
 from starid.arrays import Array, Array32, elementwise
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.elementary import acos, asin, cos, exp, hypot, log, power, sin, square
+from starid.elementary import acos, asin, atan2, cos, exp, hypot, log, log10, power, sin, square
 from starid.matrices import dot, length, product
 
 _BORDER_SAMPLES: Final = 33
@@ -118,6 +119,14 @@ def _is_lit(earth: EarthLimb, towards: Array, off_nadir_deg: float) -> bool:
     return dot(normal, sun) > 0.0
 
 
+def _left_by_baffle(sun: SunGlare, attitude: Attitude) -> float:
+    """Return the fraction of sunlight that the baffle leaves at an attitude."""
+    if sun.decade_deg == 0.0:
+        return sun.stray_share
+    outside_deg = max(_off_axis_deg(attitude, sun) - sun.exclusion_deg, 0.0)
+    return max(sun.stray_share, power(10.0, -outside_deg / sun.decade_deg))
+
+
 def _chord(angle_rad: float) -> float:
     """Chord of an angle on the unit circle."""
     return 2.0 * sin(0.5 * angle_rad)
@@ -179,6 +188,8 @@ class AreaPainter:
         ]
         if earth is not None and self._in_field(earth, self._reach_rad(earth), attitude):
             patches += self._earth_patch(earth, attitude)
+        if objects.moon is not None and objects.ghost_share > 0.0:
+            patches += self._ghost(objects.moon, objects.ghost_share, attitude)
         covers = [_transmission_of(obstruction, *self._size) for obstruction in objects.obstructions]
         if objects.blank:
             covers.append(np.zeros(self._size[::-1], dtype=np.float32))
@@ -197,7 +208,7 @@ class AreaPainter:
         nearest = _chord(max(outside, 0.0))
         if isinstance(body, SunGlare):
             reference = _chord(math.radians(_SUN_REFERENCE_DEG))
-            strength = body.stray_share * self._scattered(body.disc) * reference
+            strength = _left_by_baffle(body, attitude) * self._scattered(body.disc) * reference
             return Glare(direction, strength, _chord(math.radians(_SUN_SOFT_DEG)), nearest, cube=True)
         return Glare(direction, self._scattered(body), math.radians(_GLARE_FROM_DEG), nearest, cube=False)
 
@@ -241,6 +252,22 @@ class AreaPainter:
         disc = inside * np.clip(0.5 + (u - terminator) * scale, 0.0, 1.0) * brightness
         light = _blurred(disc.astype(np.float32), self._spot_taps)
         return [Patch(box, light, (1.0 - inside).astype(np.float32), hides_glare=False)]
+
+    def _ghost(self, moon: Moon, share: float, attitude: Attitude) -> list[Patch]:
+        """Return the disc of a Moon mirrored through the axis of the lens; it hides nothing."""
+        x, y, z = attitude.to_sensor(moon.direction)
+        mirrored = attitude.to_icrs(np.array([-x, -y, z]))
+        ghost = dataclasses.replace(
+            moon,
+            ra_deg=math.degrees(atan2(float(mirrored[1]), float(mirrored[0]))),
+            dec_deg=math.degrees(asin(max(min(float(mirrored[2]), 1.0), -1.0))),
+            bright_limb_deg=(moon.bright_limb_deg + 180.0) % 360.0,
+            magnitude=moon.magnitude - 2.5 * log10(share),
+        )
+        return [
+            dataclasses.replace(patch, passed=np.ones_like(patch.passed))
+            for patch in self._disc_patch(ghost, attitude)
+        ]
 
     def _box_around(self, direction: Array, radius_rad: float) -> Box | None:
         """Return the part of the image that holds a disc in the sensor frame; None if it is outside."""

@@ -88,6 +88,8 @@ class SunGlare(CelestialBody):
     stray_share: float = limited(0.0, 1.0, 1e-5)
     """Fraction that a baffle leaves of the light that a bare lens would scatter at 30° from the Sun; falls with the cube
     of the angle. The default is a point-source transmittance of some 7e-9 at 30° with a 12 mm f/1.2 lens."""
+    decade_deg: float = limited(0.0, 90.0, 0.0)
+    """Angle in which what the baffle leaves falls tenfold, from all at the exclusion angle to `stray_share`; 0: at once."""
     exclusion_deg: float = limited(0.0, 180.0, 0.0)
     """Angle from the boresight within which sunlight passes the baffle and saturates the image."""
     reach_deg: float = limited(0.0, 180.0, 180.0)
@@ -149,6 +151,19 @@ class PointSource(CelestialBody):
 
 
 @dataclass(frozen=True)
+class CatalogError:
+    """A star that the unit's catalogue has at another place, or with another magnitude, than the sky."""
+
+    hip: int = limited(1, 200_000)
+    """Hipparcos number."""
+    east_arcsec: float = limited(-648_000.0, 648_000.0, 0.0)
+    north_arcsec: float = limited(-324_000.0, 324_000.0, 0.0)
+    """Where the sky shows it, as seen from its place in the catalogue."""
+    fainter: float = limited(-20.0, 20.0, 0.0, unit="magnitudes")
+    """By how much the sky shows it fainter than in the catalogue."""
+
+
+@dataclass(frozen=True)
 class Obstruction:
     """A dark object near the lens that covers the image beyond a straight edge or inside a polygon."""
 
@@ -185,6 +200,16 @@ class SkyObjects:
     which Özyurt's thesis tests its algorithms, in addition to the sensor's own noise."""
     star_magnitude_noise: float = limited(0.0, 5.0, 0.0)
     """The same of a change of each star's magnitude."""
+    ghost_share: float = limited(0.0, 1.0, 0.0)
+    """Fraction of the light of each star, planet and of the Moon that reflections in the lens bring to the place mirrored
+    through its axis."""
+    catalog_position_error_arcsec: float = limited(0.0, 3600.0, 0.0)
+    """Standard deviation, along each axis, of the errors of places in the unit's catalogue: the sky shows each star elsewhere, at the
+    same place in all frames."""
+    catalog_magnitude_error: float = limited(0.0, 5.0, 0.0)
+    """The same of its magnitudes."""
+    catalog_errors: tuple[CatalogError, ...] = listed(MAX_ROWS)
+    """Single stars that the sky shows elsewhere than in the unit's catalogue, or brighter or fainter."""
     missing_stars: int = limited(0, _MAX_OBJECTS, 0)
     """Number of catalogue stars omitted, the brightest in the field."""
     cosmic_rays_s: float = limited(0.0, 1e6, 0.0)
@@ -201,8 +226,8 @@ class SkyObjects:
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Make sky objects from a table that is valid (`starhil.emulator.sensor.sky.tables`).
 
-        The keys are the fields of this class. Bodies are tables of their fields; `planets` and `obstructions`
-        are lists of tables. `blocked_share` adds an obstruction with a straight edge.
+        The keys are the fields of this class. Bodies are tables of their fields; `planets`, `catalog_errors` and
+        `obstructions` are lists of tables. `blocked_share` adds an obstruction with a straight edge.
         """
         fields = dict(values)
         share = fields.pop("blocked_share", 0.0)
@@ -210,6 +235,7 @@ class SkyObjects:
             if fields.get(name) is not None:
                 fields[name] = kind(**fields[name])
         fields["planets"] = tuple(PointSource(**row) for row in fields.get("planets", ()))
+        fields["catalog_errors"] = tuple(CatalogError(**row) for row in fields.get("catalog_errors", ()))
         edge = [Obstruction(share=share)] if share else []
         fields["obstructions"] = (*(_obstruction(row) for row in fields.get("obstructions", ())), *edge)
         if "false_star_magnitudes" in fields:

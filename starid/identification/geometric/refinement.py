@@ -43,9 +43,6 @@ from starid.kernels.small_arrays import lower_median, zero
 MAX_ROUNDS: Final = 12
 """Largest number of rounds of matching and solving."""
 
-FEW_MATCHED: Final = 30
-"""Up to this number of matches, each is tested as an outlier against the others."""
-
 OUTLIER_CHANCE: Final = 3.3e-4
 """Probability that the test rejects a good star: as for a window of 4 sigma."""
 
@@ -397,9 +394,7 @@ def refine(
         freedom = max(2 * matched - unknowns, 1)
         numbers[VARIANCE] = max(chi2, 1e-12) / freedom
         if stable:
-            worst = -1
-            if matched <= FEW_MATCHED:
-                worst = _outlier(star_table, detections, rotation, stars, normal, chi2, freedom, settings)
+            worst = _outlier(star_table, detections, rotation, stars, normal, chi2, freedom, settings)
             if worst < 0:
                 break
             excluded[worst] = True

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import re
 import select
 import socket
 import struct
@@ -55,6 +56,25 @@ def test_a_wrong_token_and_another_origin_are_answered_403(run, path):
                 assert response.status != 403
 
     run(scenario, options=OPTIONS)
+
+
+def test_every_page_that_a_tab_of_the_console_links_to_exists(run):
+    script = (server.STATIC / "js" / "main.js").read_text(encoding="utf-8")
+    named = {*re.findall(r'\w+: \["[^"]+", "(\w+)"\]', script), *re.findall(r'docs\("(\w+)"\)', script)}
+    assert {"icd", "console", "control"} <= named
+
+    async def scenario(emulation, _line):
+        found = {}
+        async with aiohttp.ClientSession() as session:
+            for name in named:
+                address = emulation.ready_fields["view"].replace("/?", f"/docs/{name}?")
+                async with session.get(address) as response:
+                    found[name] = (response.status, (await response.text()).splitlines()[0])
+        return found
+
+    found = run(scenario, options=OPTIONS, unit="st16")
+    assert {status for status, _ in found.values()} == {200}
+    assert found["icd"][1] == "# Interface definition st16 2.0"
 
 
 def test_reports_of_runs_need_the_token_and_the_files_of_the_page_do_not(run):

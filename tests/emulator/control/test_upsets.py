@@ -65,6 +65,55 @@ def test_flips_in_the_catalogue_reach_the_pipeline_until_a_restart(bench):
     assert bench.device.cycle.upsets == ()
 
 
+def test_a_stored_flip_shows_at_the_next_restart_and_survives_it(bench):
+    inject(bench, parameter="exposure", bit=3, stored=True)
+    assert bench.device.parameters["exposure"] == 100
+    assert bench.read("device_status")["parameters_changed"]  # a restart would change them
+    for _ in range(2):
+        bench.command("reset", magic=90)
+        bench.step(2.0)
+        assert bench.mode == "standby"
+        assert bench.device.parameters["exposure"] == 108
+    bench.device.parameters.set({"exposure": 100})
+    bench.command("save_parameters")
+    bench.step(1.0)
+    bench.command("reset", magic=90)
+    bench.step(2.0)
+    assert bench.device.parameters["exposure"] == 100
+
+
+def test_a_saved_value_is_flipped_not_the_default(bench):
+    bench.device.parameters.set({"exposure": 96})
+    bench.command("save_parameters")
+    bench.step(1.0)
+    inject(bench, parameter="exposure", bit=5, stored=True)
+    bench.command("reset", magic=90)
+    bench.step(2.0)
+    assert bench.device.parameters["exposure"] == 64
+
+
+def test_a_stored_flip_that_is_invalid_is_ignored_at_the_restart(bench):
+    bench.device.parameters.set({"update_rate": 2.0})
+    bench.command("save_parameters")
+    bench.step(1.0)
+    inject(bench, parameter="update_rate", bit=31, stored=True)
+    bench.command("reset", magic=90)
+    bench.step(2.0)
+    assert bench.mode == "standby"
+    assert bench.device.parameters["update_rate"] == bench.device.parameters.state.defaults["update_rate"]
+
+
+def test_a_stored_flip_in_the_catalogue_survives_a_restart_until_faults_are_cleared(bench):
+    faults = inject(bench, star=27989, component=1, bit=20, stored=True)
+    bench.command("reset", magic=90)
+    bench.step(2.0)
+    assert faults.describe() == {"device": {"upset_stars": [27989]}}
+    faults.clear()
+    bench.command("reset", magic=90)
+    bench.step(2.0)
+    assert bench.device.cycle.upsets == ()
+
+
 @pytest.mark.parametrize(
     ("upset", "message"),
     [

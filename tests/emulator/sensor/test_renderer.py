@@ -12,6 +12,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
 from starhil.emulator.sensor.renderer import Renderer, SensorModel, render
+from starhil.emulator.sensor.sky.ephemeris import Observer
 from starhil.emulator.sensor.sky.objects import SkyObjects
 from starid.attitude import Attitude, random_attitude
 from starid.camera import DEFAULT_CAMERA, Camera
@@ -307,3 +308,33 @@ def test_bad_seed_and_index_are_rejected(renderer: Renderer, catalog: StarCatalo
 def test_frames_are_frozen(renderer: Renderer) -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         renderer.render(ORION).seed = 3  # type: ignore[misc]
+
+
+def test_variable_stars_have_the_light_of_the_date(catalog: StarCatalog) -> None:
+    """Algol out of eclipse and in its middle, by the elements of the GCVS; without a date it has the light of the catalogue."""
+    perseus, algol = Attitude.from_radec_roll(47.0, 41.0, 0.0), 14576
+    renderer = Renderer(DEFAULT_CAMERA, catalog, seed=3)
+    middle_s = (2_445_641.5135 + 5420 * 2.8673043 - 2_440_587.5) * 86_400.0
+    light = {}
+    for name, observer in {
+        "none": None,
+        "eclipsed": Observer(middle_s),
+        "clear": Observer(middle_s + 86_400.0),
+    }.items():
+        stars = renderer.render(perseus, observer=observer).stars
+        light[name] = float(stars.electrons[stars.hip == algol][0])
+    assert -2.5 * np.log10(light["eclipsed"] / light["clear"]) == pytest.approx(3.39 - 2.12, abs=1e-3)
+    assert light["none"] == pytest.approx(
+        renderer.sensor.electrons(float(catalog.v[catalog.hip == algol][0])), rel=1e-6
+    )
+
+
+def test_mira_is_there_only_near_its_maximum(catalog: StarCatalog) -> None:
+    cetus, mira = Attitude.from_radec_roll(34.8, -3.0, 0.0), 10826
+    renderer = Renderer(DEFAULT_CAMERA, catalog, seed=3)
+    maximum_s = (2_444_839.0 + 49 * 331.96 - 2_440_587.5) * 86_400.0
+    bright = renderer.render(cetus, observer=Observer(maximum_s)).stars
+    assert float(bright.electrons[bright.hip == mira][0]) == pytest.approx(
+        renderer.sensor.electrons(2.0), rel=1e-3
+    )
+    assert mira not in renderer.render(cetus).stars.hip

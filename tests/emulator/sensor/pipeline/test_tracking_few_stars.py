@@ -31,10 +31,7 @@ def error_arcsec(result: FrameResult, truth: Attitude) -> float:
 
 @pytest.mark.parametrize(("largest_deg", "share"), [(WRONG_DEG, 0.6), (0.4, 0.95)])
 def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch, largest_deg: float, share: float) -> None:
-    """The larger the error that may be left, the more frames have an attitude; none that tracking adds is off by more.
-
-    What is solved as lost in space has that answer: a star that the edge cuts may turn it by more than it states.
-    """
+    """The larger the error that may be left, the more frames have an attitude; none is off by more, however it was found."""
     expose = Pipeline._expose
 
     def hidden(self: Pipeline, request: FrameRequest):
@@ -61,7 +58,7 @@ def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch, largest_deg:
         assert isinstance(without, FrameResult)
         assert isinstance(result, FrameResult)
         lost, tracked = lost + without.valid, tracked + result.valid
-        if result.valid and not without.valid:
+        if result.valid:
             assert error_arcsec(result, truth) < 3600.0 * largest_deg
         if result.valid:
             assert result.tracked

@@ -117,3 +117,50 @@ def test_a_full_moon_ten_degrees_off_the_boresight_costs_the_stars_around_it(gla
         seen.append(np.count_nonzero(gaps < 2.0))
     assert seen[0] >= 15
     assert most - 0.3 < seen[1] / seen[0] <= most
+
+
+def test_a_baffle_leaves_tenfold_less_sunlight_for_each_decade_of_angle_outside_the_exclusion_angle():
+    """From the light that a bare lens scatters, which is the same law without a baffle, to `stray_share` of it."""
+    sun = {"ra_deg": 83.8, "exclusion_deg": 30.0}
+
+    def lit(off_deg: float, **keys: float) -> float:
+        return float(light(SkyObjects(sun=SunGlare(dec_deg=off_deg - 1.2, **sun, **keys)))[468, 468])
+
+    for off_deg in (32.0, 35.0, 40.0):
+        bare = lit(off_deg, stray_share=1.0)
+        assert lit(off_deg, decade_deg=2.5) == pytest.approx(
+            bare * 10.0 ** (-(off_deg - 30.0) / 2.5), rel=1e-3
+        )
+    assert lit(60.0, decade_deg=2.5) == pytest.approx(lit(60.0), rel=1e-6)
+    assert lit(35.0) == pytest.approx(1e-5 * lit(35.0, stray_share=1.0), rel=1e-3)
+
+
+def test_ghosts_lie_opposite_to_their_stars_with_their_share_of_the_light():
+    renderer = Renderer(CAMERA, load_catalog(), SENSOR.with_(read_noise_e=0.0, bits=16, prnu=0.0), seed=1)
+    share = 0.01
+    clear, ghosted = (
+        renderer.render(ORION, exposure_s=0.1, objects=SkyObjects(ghost_share=value))
+        for value in (0.0, share)
+    )
+    more = ghosted.image.astype(float) - clear.image
+    rigel = clear.stars.xy_px[clear.stars.hip == 24436][0]
+    x, y = (2.0 * np.array(CAMERA.centre_px) - rigel).round().astype(int)
+    around = more[y - 6 : y + 7, x - 6 : x + 7].sum() * ghosted_gain()
+    electrons = float(clear.stars.electrons[clear.stars.hip == 24436][0])
+    assert around == pytest.approx(share * electrons, abs=5.0 * math.sqrt(2.0 * 13**2 * 10.0))
+
+
+def ghosted_gain() -> float:
+    """Electrons per count with 16 bits."""
+    return SENSOR.with_(bits=16).gain_e_per_dn
+
+
+def test_the_moons_ghost_lies_opposite_to_it_and_hides_nothing():
+    moon = Moon(83.8, 5.0, glare_share=0.0)
+    plain, ghosted = (light(SkyObjects(moon=moon, ghost_share=share)) for share in (0.0, 1e-4))
+    more = ghosted - plain
+    rows, columns = np.nonzero(more > 0.5 * more.max())
+    centre = CAMERA.project(ORION.to_sensor(moon.direction)[None, :])[0][0]
+    assert (columns.mean(), rows.mean()) == pytest.approx(2.0 * np.array(CAMERA.centre_px) - centre, abs=0.5)
+    assert more.sum() == pytest.approx(1e-4 * SENSOR.electrons(-12.7, 1.0), rel=0.05)
+    assert more.min() > -1e-3 * more.max()
