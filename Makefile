@@ -100,13 +100,13 @@ lowest: out/lowest/.installed
 	nice out/lowest/bin/python $(RUN_LOWEST)
 
 VERSIONS := trixie:3.13 forky:3.14
-versions: export RUN_LOWEST := $(RUN_LOWEST)
+versions: export LOWEST_TESTS = $(RUN_LOWEST)
 versions:
 	@tools/install_test_packages roots
 	@for each in $(VERSIONS); do python=python$${each#*:}; echo "$$python on Debian $${each%:*}"; \
 		tools/debian_root $${each%:*} amd64 $$python,$$python-venv sh -ec "$$python -m venv ~/venv; \
 			pip install --quiet --no-compile --upgrade --upgrade-strategy eager --editable '.[lab]' $(LOWEST_TOOLS); \
-			nice python $$RUN_LOWEST" || exit; done
+			nice python $$LOWEST_TESTS" || exit; done
 
 ARM64 := tools/debian_root trixie arm64 python3.13,python3.13-venv
 ARM64_VENV := out/roots/trixie-arm64-python3.13/root/venv
