@@ -22,8 +22,12 @@ GUARDED = {
     ("storage/cache.py", "grp"),
     ("storage/cache.py", "pwd"),
     ("storage/cache.py", "geteuid"),
+    ("storage/temporary_folder.py", "fcntl"),
+    ("storage/temporary_folder.py", "O_DIRECTORY"),
+    ("storage/temporary_folder.py", "O_NOFOLLOW"),
+    ("storage/temporary_folder.py", "geteuid"),
 }
-"""Uses after a test of `sys.platform`: owners of a folder."""
+"""Uses after a test of `sys.platform`: owners of a folder, and locks."""
 
 
 def names(tree: ast.AST) -> Iterator[str]:

@@ -151,9 +151,9 @@ MUTANTS = (
     # Store, restore and LSS
     Mutant("stored without the signature", "store", "store_restore", "if data != SAVE:", "if False:"),
     Mutant("restored without the signature", "store", "store_restore", "if data != LOAD:", "if False:"),
-    Mutant("nothing is stored", "store", "store_restore", "self._apply(subindex, self._changed(), self._on_save)", "self._apply(subindex, {}, self._on_save)"),
-    Mutant("restore changes nothing", "store", "store_restore", "self._apply(subindex, {}, self._on_restore)", "self._apply(APPLICATION_ONLY, {}, self._on_restore)"),
-    Mutant("restore counts at once", "store", "store_restore", "deferred = self._apply(subindex, {}, self._on_restore)", "deferred = self._apply(subindex, {}, self._on_restore)\n        self.load()"),
+    Mutant("nothing is stored", "store", "store_restore", "self._apply(subindex, self._changed, self._on_save)", "self._apply(subindex, dict, self._on_save)"),
+    Mutant("restore changes nothing", "store", "store_restore", "self._apply(subindex, dict, self._on_restore)", "self._apply(APPLICATION_ONLY, dict, self._on_restore)"),
+    Mutant("restore counts at once", "store", "store_restore", "deferred = self._apply(subindex, dict, self._on_restore)", "deferred = self._apply(subindex, dict, self._on_restore)\n        self.load()"),
     Mutant("groups are not kept apart", "store", "store_restore", "        if subindex == APPLICATION_ONLY:", "        if False:"),
     Mutant("LSS selected by part of the identity", "lss", "lss", "matches=number == self._identity(step)", "matches=True"),
     Mutant("LSS obeys while it waits", "lss", "lss", "        elif self.configuring:\n            self._configuration", "        elif True:\n            self._configuration"),
