@@ -1,8 +1,8 @@
 """Bright stars whose light varies with a period: their magnitude at a date.
 
 The elements are those of the General Catalogue of Variable Stars, version 5.1 (Samus et al. 2017, Astronomy Reports 61, 80), for
-β Lyrae, whose period grows by 19 s a year, those of Rucinski et al. 2019 (arXiv:1906.04831). They are all stars to V 4.5 with a range
-of half a magnitude or more whose light repeats; semiregular and irregular ones, such as Betelgeuse, have no phase to compute.
+β Lyrae, whose period grows by 19 s a year, those of Rucinski et al. 2019 (arXiv:1906.04831). Others to V 4.5 whose light
+repeats are missing: κ Pavonis, β Doradus, χ Cygni, ε Aurigae; semiregular and irregular ones, such as Betelgeuse, have no phase.
 
 A pulsating star is brightest at its epoch, falls as half a wave of a cosine, and rises likewise. An eclipsing one is faintest at
 its epoch and half a period later, in dips of the shape of a cosine; those of β Lyrae leave no time between them. Light time
