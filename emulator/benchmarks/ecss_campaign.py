@@ -161,6 +161,7 @@ class EcssDevice:
     def __init__(self, plan: EcssPlan) -> None:
         self.plan = plan
         profile = load_profile(plan.profile, [*plan.overrides, "run.clock=stepped", f"run.seed={plan.seed}"])
+        self.profile = profile
         icd = load_unit(profile.unit_source)
         setup = pipeline_setup(profile)
         sky = {**setup.sky, "bodies": self.BODIES, "aberration": True}

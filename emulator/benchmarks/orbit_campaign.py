@@ -86,20 +86,19 @@ class OrbitDevice(EcssDevice):
             raise EmulatorError(f"campaign: profile {plan.profile} has no orbit: add --orbit leo")
         self._place = self.orbit.state
         self._plan = plan
-        self._profile = load_profile(plan.profile, plan.overrides)
-        camera, sensor = self.pipeline.camera, SensorModel().with_(**self._profile.sensor)
+        camera, sensor = self.pipeline.camera, SensorModel().with_(**self.profile.sensor)
         self._default_rates = default_rates(camera.width, camera.height, sensor.pixel_um)
 
     def request(self, number: int) -> FrameRequest:
         """Return the request for a frame."""
-        plan, thermal = self._plan, self._profile.thermal
+        plan, thermal = self._plan, self.profile.thermal
         since_s = 86_400.0 * plan.days * number / plan.frames
         unix_s = self.start_unix_s + since_s
         place = self._place(unix_s)
         attitude, rate = zenith_attitude(place)
         if plan.pointing == "random":
             attitude, rate = random_attitude(np.random.default_rng((plan.seed, number))), ZERO_RATE
-        radiation = self._profile.radiation
+        radiation = self.profile.radiation
         return FrameRequest(
             index=number,
             truth=TruthState(attitude, rate).completed(unix_s, self.orbit),
