@@ -21,7 +21,7 @@ from rich.table import Table
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.timing.figures import percentile
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude
 
 CROSS_LIMIT_ARCSEC = 60.0

@@ -20,7 +20,7 @@ from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
 from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.pipeline.messages import FrameRequest
 from starhil.emulator.truth.source import TruthState
-from starid.arrays import Indices, Mask
+from starid.arithmetic.arrays import Indices, Mask
 from starid.attitude import Attitude, propagate, random_attitude, rate_between
 from starid.identification.solution import Solution
 from starid.identification.thesis.ablations import Part, without

@@ -26,7 +26,7 @@ from starhil.emulator.benchmarks.hard_sky import FASTEST_DEG_S, HARD_SENSOR, har
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Renderer
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog

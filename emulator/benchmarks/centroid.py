@@ -19,7 +19,7 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.sensor.renderer import Frame, Renderer, SensorModel
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog

@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
-from starid.arrays import Array, Indices
+from starid.arithmetic.arrays import Array, Indices
 
 SIGNIFICANCE: Final = 1e-3
 """Probability of reporting an influence that is not present."""

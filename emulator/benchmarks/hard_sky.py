@@ -8,7 +8,7 @@ import numpy as np
 
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.sky.objects import Moon, PointSource, SkyObjects, SunGlare
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude
 
 HARD_SENSOR: Final = SensorModel(limiting_magnitude=4.8, hot_pixels=500)

@@ -30,7 +30,7 @@ from starhil.emulator.sensor.sky.radiation import default_rates, particle_rate
 from starhil.emulator.sensor.sky.view import BodySource
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude, random_attitude
 from starid.storage.results import Results
 

@@ -45,11 +45,11 @@ from starhil.emulator.simulation.scheduler import Action, Event, Scheduler
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.icd.values import Value
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import square
+from starid.arithmetic.matrices import length
 from starid.attitude import ARCSEC_PER_RAD, Attitude
-from starid.elementary import square
 from starid.identification.attitude_history import AttitudeHistory
-from starid.matrices import length
 
 log = logging.getLogger("starhil.device")
 

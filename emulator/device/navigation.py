@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from starhil.emulator.truth.orbit import EARTH_RADIUS_M, KeplerOrbit
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.catalog.earth import earth_velocity
 
 ParameterValue = bool | int | float | str

@@ -9,7 +9,7 @@ from typing import Final
 
 from starhil.emulator.profile.sections import PowerConfig, ThermalConfig
 from starhil.protocol.icd.conventions import NANOSECONDS
-from starid.elementary import cos, exp, sin
+from starid.arithmetic.elementary import cos, exp, sin
 
 MILLI: Final = 1e-3
 

@@ -16,10 +16,10 @@ from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import ParameterValue
 from starhil.emulator.sensor.pipeline.messages import ZERO, Quaternion, Triple, as_quaternion, as_triple
 from starhil.protocol.icd.conventions import Conventions
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import atan2, hypot
+from starid.arithmetic.matrices import length
 from starid.attitude import Attitude
-from starid.elementary import atan2, hypot
-from starid.matrices import length
 
 _IDENTITY: Final = Attitude.identity()
 

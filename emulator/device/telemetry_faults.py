@@ -33,9 +33,9 @@ from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.icd.values import FieldError, Value
 from starhil.protocol.messages import Flaw, Reply
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import cos, sin
 from starid.attitude import Attitude
-from starid.elementary import cos, sin
 
 MAX_FAULTS: Final = 32
 """Most faults of telemetry at a time."""

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from starhil.emulator.simulation.config_model import Date, Strict, UserPath
 from starhil.emulator.truth.config import InProfileFolder, profile_paths
-from starid.elementary import square
+from starid.arithmetic.elementary import square
 
 FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
 """Duration of one stage of a frame, seconds."""

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.noise import digitize
-from starid.arrays import Array32
+from starid.arithmetic.arrays import Array32
 from starid.imaging.dark_frame import dark_excess, without_dark
 
 _HEADROOM: Final = 0.5

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from starhil.emulator.sensor.model import SensorModel
-from starid.arrays import Array32, Indices, elementwise
-from starid.elementary import exp, power, square
+from starid.arithmetic.arrays import Array32, Indices, elementwise
+from starid.arithmetic.elementary import exp, power, square
 
 _HOT_LOG_SPREAD: Final = 1.0
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.simulation.limited import limited
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import hypot, log10, power, square
 from starid.attitude import ARCSEC_PER_RAD
-from starid.elementary import hypot, log10, power, square
 
 if TYPE_CHECKING:
     from starhil.emulator.sensor.noise import Digitizer

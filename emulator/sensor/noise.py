@@ -16,8 +16,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array32, GreyImage
-from starid.elementary import hypot
+from starid.arithmetic.arrays import Array32, GreyImage
+from starid.arithmetic.elementary import hypot
 from starid.kernels.jit import compiled_ieee, inner
 
 LANES: Final = 512

@@ -12,8 +12,8 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, Array32, elementwise
-from starid.elementary import cos, log, sin, square
+from starid.arithmetic.arrays import Array, Array32, elementwise
+from starid.arithmetic.elementary import cos, log, sin, square
 
 _STEP_PX: Final = 0.1
 _LEAST_COSINE: Final = 0.02

@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Array32, elementwise
-from starid.elementary import cos, log, square
+from starid.arithmetic.arrays import Array, Array32, elementwise
+from starid.arithmetic.elementary import cos, log, square
 from starid.imaging.normal_table import normal
 from starid.kernels.jit import compiled_ieee, inner
 

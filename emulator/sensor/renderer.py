@@ -22,15 +22,15 @@ from starhil.emulator.sensor.sky.catalog_errors import as_in_the_sky
 from starhil.emulator.sensor.sky.ephemeris import Observer
 from starhil.emulator.sensor.sky.light import AreaPainter
 from starhil.emulator.sensor.sky.objects import PointSource, SkyObjects
-from starid.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask
+from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask
+from starid.arithmetic.elementary import acos, cos, square
+from starid.arithmetic.matrices import length, lengths, product
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.catalog.catalog import companions
 from starid.catalog.photometry import flux_ratio
 from starid.catalog.variable_stars import BRIGHTEST, HIP, variable_magnitudes
-from starid.elementary import acos, cos, square
-from starid.matrices import length, lengths, product
 
 __all__ = ["Frame", "Renderer", "SensorModel", "StarTruth", "render"]
 

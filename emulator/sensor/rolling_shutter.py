@@ -6,10 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, elementwise
+from starid.arithmetic.arrays import Array, elementwise
+from starid.arithmetic.elementary import cos, sin
+from starid.arithmetic.matrices import length, product
 from starid.camera import Camera
-from starid.elementary import cos, sin
-from starid.matrices import length, product
 
 _ROUNDS: Final = 3
 """Number of iterations for the row of a star and the time of this row."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from starhil.emulator.sensor.model import SensorModel
-from starid.elementary import power
+from starid.arithmetic.elementary import power
 
 STARS_TO_V6: Final = 5000.0
 """Stars in the whole sky to V = 6; their number grows by a factor 10 ** 0.5 per magnitude."""

@@ -37,9 +37,9 @@ from starhil.emulator.truth.standard_frames import (
 )
 from starhil.emulator.truth.table import FileTruth, OrbitTable
 from starhil.protocol.icd.conventions import NANOSECONDS
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.matrices import lengths
 from starid.attitude import Attitude
-from starid.matrices import lengths
 from starid.storage.files import read_number
 
 if TYPE_CHECKING:

@@ -31,9 +31,9 @@ from starhil.emulator.truth.source import (
     SlewTruth,
     TruthSource,
 )
+from starid.arithmetic.matrices import dot, length, product
 from starid.attitude import Attitude
 from starid.attitude.wahba import solve_wahba
-from starid.matrices import dot, length, product
 
 AxisRate: TypeAlias = Annotated[float, Field(ge=-MAX_RATE_DEG_S, le=MAX_RATE_DEG_S)]
 Rate: TypeAlias = Annotated[list[AxisRate], Field(min_length=3, max_length=3)]

@@ -33,9 +33,9 @@ from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.json_lines import JsonError, parse_object
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import MAX_RATE_DEG_S, Vector
+from starid.arithmetic.matrices import length
 from starid.attitude import Attitude
 from starid.catalog.earth import LATEST_UNIX_S
-from starid.matrices import length
 
 NORM_TOLERANCE: Final = 0.01
 """Largest error of the length of a quaternion that is attributed to rounding."""

@@ -16,8 +16,8 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, Vector
+from starid.arithmetic.matrices import length
 from starid.attitude import Attitude, rate_between
-from starid.matrices import length
 
 SHORTEST_S: Final = 1e-9
 """Shortest time between two messages, seconds: the resolution of simulation time."""

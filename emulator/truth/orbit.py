@@ -13,10 +13,10 @@ from typing import Any, Final, Protocol, Self, TypeAlias
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
-from starid.arrays import Array, on_grid
+from starid.arithmetic.arrays import Array, on_grid
+from starid.arithmetic.elementary import acos, atan2, cos, hypot, sin, square
+from starid.arithmetic.matrices import dot, length, product
 from starid.catalog.earth import DAY_S, UNIX_EPOCH_JD, VELOCITY_GRID_M_S, terrestrial_time
-from starid.elementary import acos, atan2, cos, hypot, sin, square
-from starid.matrices import dot, length, product
 
 Vector: TypeAlias = Array
 

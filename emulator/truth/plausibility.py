@@ -14,9 +14,9 @@ from datetime import UTC, datetime
 from typing import Final
 
 from starhil.emulator.truth.orbit import EARTH_GM_M3_S2, OrbitState
+from starid.arithmetic.elementary import square
+from starid.arithmetic.matrices import length
 from starid.catalog.earth import DAY_S
-from starid.elementary import square
-from starid.matrices import length
 
 SURFACE_M: Final = 6.35e6
 """Distance from the Earth's centre below which nothing flies: the poles are at 6357 km."""

@@ -17,10 +17,10 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.orbit import Orbit, OrbitState
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import square
+from starid.arithmetic.matrices import length
 from starid.attitude import Attitude, propagate
-from starid.elementary import square
-from starid.matrices import length
 
 Vector: TypeAlias = Array
 

@@ -21,7 +21,7 @@ from starhil.emulator.truth.plausibility import doubt_of_orbit
 from starhil.emulator.truth.source import Vector
 from starhil.emulator.truth.table import FileTruth, OrbitTable, Span
 from starhil.protocol.icd.conventions import NANOSECONDS
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude
 from starid.catalog.earth import utc_of_tai
 

@@ -20,7 +20,7 @@ import numpy as np
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.orbit import OrbitState, interpolate_orbit
 from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude, interpolate, rate_between
 from starid.attitude.attitude import interpolate_with_rates
 

@@ -25,8 +25,8 @@ from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starhil.emulator.truth.table import FileTruth
 from starhil.protocol.icd.conventions import NANOSECONDS
+from starid.arithmetic.matrices import product
 from starid.attitude import Attitude
-from starid.matrices import product
 
 
 @dataclass(frozen=True)

@@ -23,10 +23,10 @@ from typing import Final, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array
-from starid.elementary import atan2, cos, hypot, sin, square, tan
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import atan2, cos, hypot, sin, square, tan
+from starid.arithmetic.matrices import dot, length, product
 from starid.errors import StaridError
-from starid.matrices import dot, length, product
 
 ARCSEC_PER_RAD: Final = 180.0 * 3600.0 / math.pi
 """Arcseconds in one radian."""

@@ -23,11 +23,11 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import square
+from starid.arithmetic.matrices import dot, eigenvectors, inverse, length, lengths, product, sum_of_products
 from starid.attitude.attitude import Attitude, quaternion_of
-from starid.elementary import square
 from starid.errors import StaridError
-from starid.matrices import dot, eigenvectors, inverse, length, lengths, product, sum_of_products
 
 Method = Literal["davenport", "quest", "esoq2", "foam", "svd"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)

@@ -21,7 +21,7 @@ from typing import Final, cast
 
 import numpy as np
 
-from starid.arrays import Array, Mask
+from starid.arithmetic.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.attitude.wahba import solve_wahba
 from starid.camera.camera import Camera

@@ -14,7 +14,9 @@ from typing import Any, Final, Literal, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array, Mask, elementwise
+from starid.arithmetic.arrays import Array, Mask, elementwise
+from starid.arithmetic.elementary import atan2, square, tan
+from starid.arithmetic.matrices import lengths
 from starid.attitude import Attitude
 from starid.camera.projection import (
     EQUIDISTANT,
@@ -29,9 +31,7 @@ from starid.camera.projection import (
     project_kernel,
     undistorted_reach,
 )
-from starid.elementary import atan2, square, tan
 from starid.errors import StaridError
-from starid.matrices import lengths
 
 Model = Literal["pinhole", "equidistant", "flat"]
 

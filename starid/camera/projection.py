@@ -18,8 +18,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Mask
-from starid.elementary import atan2, cos, hypot, sin
+from starid.arithmetic.arrays import Array, Mask
+from starid.arithmetic.elementary import atan2, cos, hypot, sin
 from starid.kernels.jit import compiled, inner_checked
 
 PINHOLE: Final = 0

@@ -17,9 +17,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.matrices import length
 from starid.errors import StaridError
-from starid.matrices import length
 
 SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
 

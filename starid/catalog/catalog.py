@@ -13,14 +13,14 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starid.arrays import Array, Indices32, elementwise
+from starid.arithmetic.arrays import Array, Indices32, elementwise
+from starid.arithmetic.elementary import asin, atan2, cos, hypot, log10, sin, square
+from starid.arithmetic.matrices import length, lengths
 from starid.catalog.aberration import aberrated
 from starid.catalog.hipparcos import EPOCH, default_path, read_hip2
 from starid.catalog.photometry import absolute_magnitude, fitted_share, flux_ratio, v_from_hp
 from starid.catalog.published import PUBLISHED_V, with_missing_stars
-from starid.elementary import asin, atan2, cos, hypot, log10, sin, square
 from starid.errors import StaridError
-from starid.matrices import length, lengths
 from starid.storage.cache import cached_tables
 
 Band = Literal["v", "hp"]

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from typing import Any, Final
 
-from starid.arrays import Array, on_grid
+from starid.arithmetic.arrays import Array, on_grid
 
 ASTRONOMICAL_UNIT_M: Final = 149_597_870_700.0
 DAY_S: Final = 86_400.0

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.errors import StaridError
 from starid.storage.files import MEGABYTE, open_regular
 

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array, elementwise, interpolated
-from starid.elementary import exp, log10, power, square
+from starid.arithmetic.arrays import Array, elementwise, interpolated
+from starid.arithmetic.elementary import exp, log10, power, square
 
 EVEN_PAIR: Final = 0.45
 """Brightness ratio from which a single spot fits two stars at their centre of light."""

@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import cos
 from starid.catalog.hipparcos import EPOCH
 from starid.catalog.photometry import v_from_hp
-from starid.elementary import cos
 
 PUBLISHED_V: Final = {32349: -1.44, 30438: -0.74, 71681: 1.33, 55203: 3.79, 78727: 4.17}
 """Published V: Sirius and Canopus, which are too bright for Hipparcos; alpha Centauri B, whose Hp has light of A; and the missing

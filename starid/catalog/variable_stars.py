@@ -16,8 +16,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from starid.arrays import Array, Indices
-from starid.elementary import cos
+from starid.arithmetic.arrays import Array, Indices
+from starid.arithmetic.elementary import cos
 
 _UNIX_EPOCH_JD: Final = 2_440_587.5
 _DAY_S: Final = 86_400.0

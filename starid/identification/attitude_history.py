@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import square
 from starid.attitude import Attitude, propagate
-from starid.elementary import square
 
 RATE_SPAN_S: Final = 2.0
 """Age up to which attitudes are used for the rate, seconds; the last two are always used."""

@@ -23,16 +23,16 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, elementwise
+from starid.arithmetic.arrays import Array, Indices, elementwise
+from starid.arithmetic.elementary import exp, log, log10, square
+from starid.arithmetic.matrices import carried, dot, eigenvectors, inverse, product
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.camera.position_errors import camera_jacobian, error_matrices, rotation_jacobian
 from starid.catalog import StarCatalog
 from starid.catalog.aberration import aberrated
-from starid.elementary import exp, log, log10, square
 from starid.identification.solution import Reason, Solution
 from starid.imaging.detection import Detections
-from starid.matrices import carried, dot, eigenvectors, inverse, product
 
 MIN_STARS: Final = 2
 """Least number of stars."""

@@ -11,11 +11,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import square
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog, load_catalog
-from starid.elementary import square
 from starid.errors import StaridError
 from starid.identification.solution import Solution
 

@@ -7,7 +7,7 @@ from typing import Any, Protocol, cast, runtime_checkable
 
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog

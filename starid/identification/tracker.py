@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude
 from starid.errors import StaridError
 from starid.identification.attitude_history import AttitudeHistory

@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array, Indices32, Mask
+from starid.arithmetic.arrays import Array, Indices32, Mask
+from starid.arithmetic.elementary import square
 from starid.camera import Camera
 from starid.catalog import StarCatalog
-from starid.elementary import square
 from starid.errors import StaridError
 from starid.identification.solution import Solution
 

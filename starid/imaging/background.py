@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array32, GreyImage
-from starid.elementary import square
+from starid.arithmetic.arrays import Array32, GreyImage
+from starid.arithmetic.elementary import square
 from starid.errors import StaridError
 from starid.kernels.jit import compiled_ieee, inner
 

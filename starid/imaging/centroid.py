@@ -14,8 +14,8 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from starid.arrays import Array, Array32, record_type
-from starid.elementary import hypot
+from starid.arithmetic.arrays import Array, Array32, record_type
+from starid.arithmetic.elementary import hypot
 from starid.imaging.normal_table import normal, quick_normal
 from starid.kernels.jit import compiled_ieee
 

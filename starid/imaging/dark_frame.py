@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array32
+from starid.arithmetic.arrays import Array32
 from starid.errors import StaridError
 
 _BLIND_SHARE: Final = 0.5

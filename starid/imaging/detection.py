@@ -11,8 +11,8 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask, Records
-from starid.elementary import square
+from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask, Records
+from starid.arithmetic.elementary import square
 from starid.errors import StaridError
 from starid.imaging.background import Background, estimate_background
 from starid.imaging.centroid import (

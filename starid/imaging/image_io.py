@@ -13,9 +13,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import GreyImage
+from starid.arithmetic.arrays import GreyImage
+from starid.arithmetic.matrices import product
 from starid.errors import StaridError
-from starid.matrices import product
 from starid.storage.files import MEGABYTE, is_stream, read_bytes, write_atomically
 
 IMAGE_LIMIT: Final = 1000 * MEGABYTE

@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array32, GreyImage, Indices32
-from starid.elementary import square
+from starid.arithmetic.arrays import Array32, GreyImage, Indices32
+from starid.arithmetic.elementary import square
 from starid.imaging.background import block_position
 from starid.imaging.normal_table import distribution
 from starid.kernels.jit import compiled_ieee

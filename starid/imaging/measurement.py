@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, Array32, Indices, Indices32, Mask, Records
-from starid.elementary import hypot
+from starid.arithmetic.arrays import Array, Array32, Indices, Indices32, Mask, Records
+from starid.arithmetic.elementary import hypot
 from starid.imaging.centroid import (
     FAINT,
     GOOD,

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.elementary import exp
+from starid.arithmetic.elementary import exp
 from starid.kernels.jit import compiled_ieee, inner
 
 REACH: Final = 8.0

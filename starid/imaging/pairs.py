@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Array32, Indices, Indices32, Mask, Records
+from starid.arithmetic.arrays import Array, Array32, Indices, Indices32, Mask, Records
+from starid.arithmetic.elementary import exp, hypot, square
 from starid.catalog.photometry import EVEN_PAIR
-from starid.elementary import exp, hypot, square
 from starid.imaging.centroid import (
     FIT,
     GOOD,

@@ -13,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Array32, GreyImage, Indices32, Mask, interpolated
-from starid.elementary import square
+from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices32, Mask, interpolated
+from starid.arithmetic.elementary import square
 from starid.imaging.background import interpolate_at, median
 from starid.imaging.normal_table import gaussian
 from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, lengths_and_mismatches

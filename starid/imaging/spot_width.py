@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Array32, GreyImage, Indices32
+from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices32
 from starid.imaging.background import interpolate_at
 from starid.imaging.centroid import FIT, GOOD, Fit, fit_star, spot_model
 from starid.kernels.jit import compiled_ieee

@@ -11,12 +11,12 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, GreyImage, Indices, Mask
-from starid.elementary import square
+from starid.arithmetic.arrays import Array, GreyImage, Indices, Mask
+from starid.arithmetic.elementary import square
+from starid.arithmetic.matrices import lengths
 from starid.errors import StaridError
 from starid.imaging.background import BLOCK_PX, estimate_background
 from starid.imaging.detection import Detections, DetectionSettings, detect
-from starid.matrices import lengths
 
 TILE_PX: Final = 2 * BLOCK_PX
 """Side of a tile."""

@@ -12,8 +12,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, GreyImage
-from starid.elementary import hypot, square
+from starid.arithmetic.arrays import Array, GreyImage
+from starid.arithmetic.elementary import hypot, square
 from starid.imaging.matched_filter import spot_taps
 from starid.imaging.trail_flow import trail_at
 from starid.kernels.jit import compiled_ieee

@@ -15,8 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array
-from starid.elementary import hypot
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import hypot
 from starid.imaging.normal_table import normal
 from starid.kernels.jit import compiled_ieee
 from starid.kernels.small_arrays import copy_values, median

@@ -8,8 +8,8 @@ from typing import Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, Array32, GreyImage, Indices32, Records, record_type
-from starid.elementary import cos, log, sin
+from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices32, Records, record_type
+from starid.arithmetic.elementary import cos, log, sin
 from starid.imaging.background import MIN_NOISE_DN, interpolate_at
 from starid.imaging.trail_flow import trail_at
 from starid.kernels.jit import compiled_ieee

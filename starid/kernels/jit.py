@@ -2,7 +2,7 @@
 
 A kernel is compiled, or loaded from the cache (`starid.kernels.kernel_cache`), when it is first called with arguments of certain
 types. The process that answers the bus imports no module with kernels. Sums are never reordered (no ``fastmath``), so
-that a kernel gives the same bytes on each processor, and kernels call the functions of `starid.elementary` in place of those of
+that a kernel gives the same bytes on each processor, and kernels call the functions of `starid.arithmetic.elementary` in place of those of
 `math`. Numba lets a function inherit an option that it does not set from the kernel that calls it, so all set the error model.
 """
 
@@ -12,7 +12,7 @@ from collections.abc import Callable
 from types import FunctionType
 from typing import Final, TypeVar, cast
 
-from starid import elementary
+from starid.arithmetic import elementary
 from starid.kernels.kernel_cache import use_kernel_cache
 
 _CACHED: Final = use_kernel_cache()  # before numba reads its environment

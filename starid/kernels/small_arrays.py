@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from starid.arrays import Array, Array32
+from starid.arithmetic.arrays import Array, Array32
 from starid.kernels.jit import inner
 
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask
+from starid.arithmetic.arrays import Array, Indices, Mask
 from starid.identification.thesis.false_stars import ObservedFrame
 from starid.identification.thesis.frame_sky import FrameSky, SkyError
 

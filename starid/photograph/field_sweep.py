@@ -7,7 +7,7 @@ from typing import Final
 
 from numpy.typing import ArrayLike
 
-from starid.arrays import GreyImage
+from starid.arithmetic.arrays import GreyImage
 from starid.camera import Camera, Model
 from starid.catalog import StarCatalog
 from starid.imaging.detection import DetectionSettings

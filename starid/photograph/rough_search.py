@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from starid.arrays import GreyImage
+from starid.arithmetic.arrays import GreyImage
 from starid.imaging.background import BLOCK_PX, MIN_NOISE_DN, estimate_background
 from starid.imaging.detection import Detections, DetectionSettings, detect
 

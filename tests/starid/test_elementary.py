@@ -11,8 +11,8 @@ import pytest
 from numba import njit
 
 import starid.kernels.jit  # noqa: F401  (lets numba compile them)
-from starid import elementary
-from starid.elementary import acos, asin, atan, atan2, cos, exp, hypot, log, log10, power, sin, tan
+from starid.arithmetic import elementary
+from starid.arithmetic.elementary import acos, asin, atan, atan2, cos, exp, hypot, log, log10, power, sin, tan
 
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459230781640628620899")
 DIGITS = 60

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starid.arrays import interpolated, on_grid
-from starid.matrices import (
+from starid.arithmetic.arrays import interpolated, on_grid
+from starid.arithmetic.matrices import (
     carried,
     dot,
     eigenvectors,

@@ -14,10 +14,10 @@ import numpy as np
 from starhil.emulator.sensor.pipeline.messages import FrameResult
 from starhil.emulator.sensor.sky.light import disc_in_field, through_baffle
 from starhil.emulator.sensor.sky.objects import SkyObjects
-from starid.arrays import Array, Mask
+from starid.arithmetic.arrays import Array, Mask
+from starid.arithmetic.matrices import lengths
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.matrices import lengths
 
 _BRIGHTEST: Final = 200
 """Number of a frame's stars that are looked for; detections of other light rarely coincide with so few."""

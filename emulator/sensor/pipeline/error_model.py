@@ -38,7 +38,7 @@ from starhil.emulator.sensor.pipeline.messages import (
 )
 from starhil.emulator.sensor.star_count import STARS_TO_V6, mean_stars
 from starhil.emulator.simulation.signal import Signal
-from starid.elementary import acos, hypot, log10, square
+from starid.arithmetic.elementary import acos, hypot, log10, square
 
 ARCSEC: Final = math.radians(1.0 / 3600.0)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, Self, TypeAlias
 
 from starhil.emulator.truth.source import TruthState
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude
 from starid.identification.solution import FeatureReport
 

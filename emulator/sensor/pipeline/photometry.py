@@ -14,11 +14,11 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.sensor.renderer import Frame
-from starid.arrays import Array, Mask, elementwise
+from starid.arithmetic.arrays import Array, Mask, elementwise
+from starid.arithmetic.elementary import exp, log, log10, square
+from starid.arithmetic.matrices import inverse, lengths, product, sum_of_products
 from starid.attitude import Attitude, random_attitude
-from starid.elementary import exp, log, log10, square
 from starid.imaging.detection import Detections
-from starid.matrices import inverse, lengths, product, sum_of_products
 
 FIELDS: Final = 96
 """Number of fields rendered."""

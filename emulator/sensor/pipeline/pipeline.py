@@ -46,13 +46,14 @@ from starhil.emulator.sensor.renderer import Frame, Renderer, frame_without_trut
 from starhil.emulator.sensor.sky.objects import SkyObjects
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
-from starid.arrays import Array, Mask
+from starid.arithmetic.arrays import Array, Mask
+from starid.arithmetic.elementary import log10
+from starid.arithmetic.matrices import length, lengths
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.camera.position_errors import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
 from starid.catalog.aberration import aberrated
-from starid.elementary import log10
 from starid.errors import StaridError
 from starid.identification.geometric.identifier import Effort
 from starid.identification.geometric.index_choice import pixels_per_radian
@@ -64,7 +65,6 @@ from starid.identification.solution import Reason, Solution
 from starid.identification.star_identifier import StarIdentifier
 from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.imaging.star_windows import detect_near
-from starid.matrices import length, lengths
 
 STARS_SENT: Final = 16
 """Number of identified stars returned to the device; the brightest ones."""

@@ -31,7 +31,7 @@ from starhil.emulator.sensor.pipeline.bodies import SEEN_PX
 from starhil.emulator.sensor.pipeline.messages import Preview
 from starhil.emulator.sensor.renderer import Frame
 from starhil.emulator.sensor.sky.objects import CelestialBody, Obstruction, SkyObjects
-from starid.arrays import Array, GreyImage, Indices32
+from starid.arithmetic.arrays import Array, GreyImage, Indices32
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.identification.solution import FeatureReport, Solution

@@ -14,8 +14,8 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from starid.arrays import Array, Array32
-from starid.elementary import square
+from starid.arithmetic.arrays import Array, Array32
+from starid.arithmetic.elementary import square
 
 _BLOCK_PIXELS: Final = 1 << 15
 """Pixels that are computed together: some planes of them fit the processor's cache."""

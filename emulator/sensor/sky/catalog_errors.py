@@ -10,10 +10,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from starhil.emulator.sensor.sky.objects import CatalogError
-from starid.arrays import Array, Indices32
+from starid.arithmetic.arrays import Array, Indices32
+from starid.arithmetic.elementary import cos, sin
+from starid.arithmetic.matrices import lengths
 from starid.attitude import ARCSEC_PER_RAD
-from starid.elementary import cos, sin
-from starid.matrices import lengths
 
 
 def displaced(vectors: Array, east_arcsec: Array, north_arcsec: Array) -> Array:

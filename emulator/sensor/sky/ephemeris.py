@@ -18,11 +18,11 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.sensor.sky.objects import CelestialBody, EarthLimb, Moon, PointSource, SunGlare
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import acos, asin, atan, atan2, cos, exp, hypot, log10, sin, square
+from starid.arithmetic.matrices import dot, length, lengths
 from starid.catalog.aberration import SPEED_OF_LIGHT_M_S, aberrated
 from starid.catalog.earth import ASTRONOMICAL_UNIT_M, DAY_S, in_metres, terrestrial_time
-from starid.elementary import acos, asin, atan, atan2, cos, exp, hypot, log10, sin, square
-from starid.matrices import dot, length, lengths
 
 Vector = Array
 

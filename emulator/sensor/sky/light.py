@@ -27,11 +27,11 @@ from starhil.emulator.sensor.sky.objects import (
     SkyObjects,
     SunGlare,
 )
-from starid.arrays import Array, Array32, elementwise
+from starid.arithmetic.arrays import Array, Array32, elementwise
+from starid.arithmetic.elementary import acos, asin, atan2, cos, exp, hypot, log, log10, power, sin, square
+from starid.arithmetic.matrices import dot, length, product
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.elementary import acos, asin, atan2, cos, exp, hypot, log, log10, power, sin, square
-from starid.matrices import dot, length, product
 
 _BORDER_SAMPLES: Final = 33
 _GLARE_FROM_DEG: Final = 0.3

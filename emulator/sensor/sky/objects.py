@@ -15,8 +15,8 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.simulation.limited import limited, listed
-from starid.arrays import Array
-from starid.elementary import cos, sin
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import cos, sin
 
 _MAX_OBJECTS: Final = 100_000
 

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.elementary import asin, atan2, exp, square
+from starid.arithmetic.elementary import asin, atan2, exp, square
 
 EARTH_RADIUS_KM: Final = 6371.0
 REFERENCE_ALTITUDE_KM: Final = 500.0

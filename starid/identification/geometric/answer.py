@@ -7,8 +7,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from starid.arrays import Array, Indices
-from starid.elementary import log, square
+from starid.arithmetic.arrays import Array, Indices
+from starid.arithmetic.elementary import log, square
 from starid.identification.geometric.observation import SIGMA_U, SIGMA_V, SOURCE, Raw, Table
 from starid.identification.geometric.pattern_index import IndexArrays
 from starid.identification.geometric.refinement import (

@@ -16,12 +16,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array, Records
+from starid.arithmetic.arrays import Array, Records
+from starid.arithmetic.elementary import exp, log, sin, square, tan
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.catalog.aberration import checked_beta
-from starid.elementary import exp, log, sin, square, tan
 from starid.errors import StaridError
 from starid.identification.geometric.answer import MIN_MATCHED, Answer
 from starid.identification.geometric.index_choice import (

@@ -10,9 +10,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from starid.arithmetic.elementary import power, square
 from starid.camera import Camera
 from starid.catalog import StarCatalog
-from starid.elementary import power, square
 from starid.errors import StaridError
 from starid.identification.geometric import index_file
 from starid.identification.geometric.pattern_index import (

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Indices
+from starid.arithmetic.arrays import Indices
 from starid.identification.geometric.pattern_index import (
     SIDE_BINS,
     SIDE_STEP,

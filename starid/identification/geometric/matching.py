@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask
-from starid.elementary import square
+from starid.arithmetic.arrays import Array, Indices, Mask
+from starid.arithmetic.elementary import square
 from starid.identification.geometric.observation import (
     MAGNITUDE,
     SIGMA_U,

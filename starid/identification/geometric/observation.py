@@ -7,7 +7,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arithmetic.arrays import Array, Indices
+from starid.arithmetic.elementary import atan2, cos, log10, sin
 from starid.camera.projection import (
     CX,
     CY,
@@ -25,7 +26,6 @@ from starid.camera.projection import (
     plane_slopes,
     undistort,
 )
-from starid.elementary import atan2, cos, log10, sin
 from starid.kernels.jit import inner
 from starid.kernels.small_arrays import zero
 

@@ -21,16 +21,16 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices, Indices32, Mask
+from starid.arithmetic.arrays import Array, Indices, Indices32, Mask
+from starid.arithmetic.elementary import sin, square
+from starid.arithmetic.matrices import lengths
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.catalog.catalog import companions, merge_close_stars
-from starid.elementary import sin, square
 from starid.errors import StaridError
 from starid.identification.geometric.pattern_stars import select_pattern_stars
 from starid.identification.geometric.sky_grid import FACES, build_sky_grid, cell_of
 from starid.kernels.jit import compiled_ieee, inner
-from starid.matrices import lengths
 
 INDEX_VERSION: Final = 5
 """Incremented whenever the same catalogue and settings would yield a different index."""

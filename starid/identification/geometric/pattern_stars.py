@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask
-from starid.elementary import acos, sin
+from starid.arithmetic.arrays import Array, Indices, Mask
+from starid.arithmetic.elementary import acos, sin
 from starid.kernels.jit import compiled_ieee
 
 _FINEST_CELL: Final = 0.01

@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
-from starid.elementary import cos, exp, power, sin, square
+from starid.arithmetic.arrays import Array, Indices
+from starid.arithmetic.elementary import cos, exp, power, sin, square
 from starid.identification.geometric.matching import BY_NOISE, match_detections, residual
 from starid.identification.geometric.observation import (
     MAGNITUDE,

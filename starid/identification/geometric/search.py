@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Records
+from starid.arithmetic.arrays import Array, Indices, Records
 from starid.camera.projection import CX, CY, HEIGHT, MODEL, WIDTH
 from starid.identification.geometric.answer import (
     Answer,

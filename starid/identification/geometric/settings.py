@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final, Protocol
 
-from starid.arrays import record_type
+from starid.arithmetic.arrays import record_type
 
 
 class Settings(Protocol):

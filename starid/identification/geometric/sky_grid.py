@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices32
-from starid.elementary import acos, cos
+from starid.arithmetic.arrays import Array, Indices32
+from starid.arithmetic.elementary import acos, cos
 from starid.kernels.jit import compiled_ieee, inner
 
 FACES: Final = 6

@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Records
+from starid.arithmetic.arrays import Array, Indices, Records
 from starid.camera.projection import MODEL
 from starid.identification.geometric.answer import (
     MIN_MATCHED,

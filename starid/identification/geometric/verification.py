@@ -30,9 +30,9 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Indices32
+from starid.arithmetic.arrays import Array, Indices, Indices32
+from starid.arithmetic.elementary import exp, log, square
 from starid.camera.projection import MODEL
-from starid.elementary import exp, log, square
 from starid.identification.geometric.matching import residual
 from starid.identification.geometric.observation import MAGNITUDE, SIGMA_U, SIGMA_V, Table, X, Y, Z, scaled
 from starid.identification.geometric.pattern_index import (

@@ -10,7 +10,7 @@ from typing import Final, Literal, cast, get_args
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.errors import StaridError
 from starid.identification.thesis.false_stars import FalseStarFilter, FilterResult, ObservedFrame
 from starid.identification.thesis.feature_search import FeatureSearch

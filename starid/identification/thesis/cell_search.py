@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices, Indices32
+from starid.arithmetic.arrays import Array, Indices, Indices32
 from starid.identification.thesis.database import CODE_MAX, FeatureDatabase
 from starid.identification.thesis.features import FEATURE_COUNT
 from starid.identification.thesis.frame_grid import GridArrays, cell_centre

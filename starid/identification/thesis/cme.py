@@ -12,11 +12,11 @@ from typing import Final, Literal
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask
-from starid.elementary import atan2, exp, hypot, log, square
+from starid.arithmetic.arrays import Array, Indices, Mask
+from starid.arithmetic.elementary import atan2, exp, hypot, log, square
+from starid.arithmetic.matrices import product
 from starid.identification.thesis.false_stars import FilterError, ObservedFrame
 from starid.kernels.jit import compiled, inner_checked
-from starid.matrices import product
 
 MotionModel = Literal["rigid", "affine"]
 

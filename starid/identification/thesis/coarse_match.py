@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
-from starid.elementary import atan2, cos, hypot, sin, square
+from starid.arithmetic.arrays import Array, Indices
+from starid.arithmetic.elementary import atan2, cos, hypot, sin, square
 from starid.identification.thesis.frame_sky import SkyArrays, stars_near
 from starid.kernels.jit import compiled, inner_checked
 

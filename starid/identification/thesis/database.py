@@ -14,10 +14,10 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import atan2, hypot, tan
 from starid.camera import Camera
 from starid.catalog import Band, StarCatalog
-from starid.elementary import atan2, hypot, tan
 from starid.errors import StaridError
 from starid.identification.thesis.features import FEATURE_COUNT, FeatureVector
 from starid.identification.thesis.frame_grid import FrameGrid, Geometry, GridArrays, make_grid

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask
+from starid.arithmetic.arrays import Array, Indices, Mask
 from starid.errors import StaridError
 
 

@@ -13,10 +13,10 @@ from typing import Final, Self
 
 import numpy as np
 
-from starid.arrays import Array, elementwise
+from starid.arithmetic.arrays import Array, elementwise
+from starid.arithmetic.elementary import exp, hypot, log, square
 from starid.attitude import Attitude, random_attitude
 from starid.catalog.photometry import flux_ratio
-from starid.elementary import exp, hypot, log, square
 from starid.identification.thesis.feature_search import FeatureSearch
 from starid.identification.thesis.features import FeatureVector
 

@@ -14,18 +14,18 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask, elementwise
+from starid.arithmetic.arrays import Array, Indices, Mask, elementwise
+from starid.arithmetic.elementary import cos, log10, sin, square
+from starid.arithmetic.matrices import product
 from starid.attitude import Attitude
 from starid.attitude.wahba import solve_wahba
 from starid.camera import Camera
-from starid.elementary import cos, log10, sin, square
 from starid.identification.thesis.coarse_match import next_candidate
 from starid.identification.thesis.database import FeatureDatabase
 from starid.identification.thesis.features import FeatureVector, extract_features
 from starid.identification.thesis.frame_sky import UX, UZ, FrameSky
 from starid.identification.thesis.lsi import LostInSpace, LsiEstimate, LsiSolution
 from starid.identification.thesis.search_spots import Spots, places_not_tried
-from starid.matrices import product
 
 MIN_STARS: Final = 3
 """Fewest stars of a field that has features."""

@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array
-from starid.elementary import atan2, cos, sin
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import atan2, cos, sin
 from starid.errors import StaridError
 from starid.kernels.jit import compiled, inner_checked
 

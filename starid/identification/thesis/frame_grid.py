@@ -8,8 +8,8 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from starid.arrays import Array, Indices, elementwise
-from starid.elementary import cos, square
+from starid.arithmetic.arrays import Array, Indices, elementwise
+from starid.arithmetic.elementary import cos, square
 from starid.errors import StaridError
 from starid.kernels.jit import compiled, inner_checked
 

@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
-from starid.elementary import atan2, cos, sin, square
+from starid.arithmetic.arrays import Array, Indices
+from starid.arithmetic.elementary import atan2, cos, sin, square
 from starid.kernels.jit import compiled, inner_checked
 
 MAX_VOTERS: Final = 48

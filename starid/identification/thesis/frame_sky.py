@@ -9,8 +9,8 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from starid.arrays import Array, Indices, elementwise
-from starid.elementary import asin, atan, cos, sin, square
+from starid.arithmetic.arrays import Array, Indices, elementwise
+from starid.arithmetic.elementary import asin, atan, cos, sin, square
 from starid.errors import StaridError
 from starid.identification.thesis.features import (
     SUM_COUNT,

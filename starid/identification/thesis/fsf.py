@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask
-from starid.elementary import atan2, square
+from starid.arithmetic.arrays import Array, Indices, Mask
+from starid.arithmetic.elementary import atan2, square
 from starid.identification.thesis.false_stars import FilterError, FilterResult, ObservedFrame
 from starid.kernels.jit import compiled, inner_checked
 

@@ -15,8 +15,8 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask
-from starid.elementary import square
+from starid.arithmetic.arrays import Array, Indices, Mask
+from starid.arithmetic.elementary import square
 from starid.kernels.jit import compiled, inner_checked
 
 LAMBDAS: Final[Array] = np.arange(1, 101, dtype=np.float64) * np.float64(0.05)

@@ -11,8 +11,9 @@ from typing import Final, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices
-from starid.elementary import atan2, cos, hypot, sin, square
+from starid.arithmetic.arrays import Array, Indices
+from starid.arithmetic.elementary import atan2, cos, hypot, sin, square
+from starid.arithmetic.matrices import product
 from starid.identification.options import Solver
 from starid.identification.thesis.cell_search import (
     CellArrays,
@@ -30,7 +31,6 @@ from starid.identification.thesis.lasso import LAMBDAS, choose_lambdas, lasso_pa
 from starid.identification.thesis.matlab_lasso import matlab_path
 from starid.identification.thesis.reference import ReferenceSearch, reference_path
 from starid.kernels.jit import compiled, inner_checked
-from starid.matrices import product
 
 Precision = Literal["exact", "stored"]
 LassoPath = Callable[[Array, Array], Array]

@@ -22,11 +22,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array, Mask, elementwise
+from starid.arithmetic.arrays import Array, Mask, elementwise
+from starid.arithmetic.elementary import cos, log10, sin, tan
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
-from starid.elementary import cos, log10, sin, tan
 from starid.errors import StaridError
 from starid.identification.geometric.identifier import Identifier
 from starid.identification.geometric.pattern_index import resolved_stars

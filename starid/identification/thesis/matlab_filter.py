@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask
+from starid.arithmetic.arrays import Array, Indices, Mask
 from starid.identification.thesis.cme import affine_fit, transform_distances
 from starid.identification.thesis.false_stars import FilterResult, ObservedFrame
 from starid.identification.thesis.fsf import ClusterFilter

@@ -15,7 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Mask
+from starid.arithmetic.arrays import Array, Mask
 from starid.kernels.jit import compiled, inner_checked
 
 RELATIVE_TOLERANCE: Final = 1e-4

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starid.arrays import Array, Indices, Mask
+from starid.arithmetic.arrays import Array, Indices, Mask
 
 
 def boresight_error(

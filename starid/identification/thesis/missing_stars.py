@@ -16,15 +16,15 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, elementwise
-from starid.elementary import cos, sin, square
+from starid.arithmetic.arrays import Array, elementwise
+from starid.arithmetic.elementary import cos, sin, square
+from starid.arithmetic.matrices import lengths
 from starid.identification.thesis.cme import CameraMotion
 from starid.identification.thesis.database import DatabaseError
 from starid.identification.thesis.false_stars import FilterResult, ObservedFrame
 from starid.identification.thesis.features import extract_features
 from starid.identification.thesis.lsi import LostInSpace
 from starid.identification.thesis.metrics import boresight_error
-from starid.matrices import lengths
 
 MAX_ERROR_PSI: Final = 2.0
 """Largest ε_ψ of a circle that votes; beyond it, its features fit no cell."""

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arithmetic.arrays import Array, Indices
 from starid.errors import StaridError
 from starid.identification.thesis.database import FeatureDatabase
 from starid.identification.thesis.false_stars import FilterResult, ObservedFrame

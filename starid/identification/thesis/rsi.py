@@ -9,8 +9,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from starid.arrays import Array, Mask
-from starid.elementary import square
+from starid.arithmetic.arrays import Array, Mask
+from starid.arithmetic.elementary import square
 from starid.errors import StaridError
 from starid.identification.thesis.cme import CameraMotion, MotionModel, matched_motion
 from starid.identification.thesis.false_stars import FalseStarFilter, ObservedFrame

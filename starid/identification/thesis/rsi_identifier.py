@@ -16,11 +16,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array, Mask, elementwise
+from starid.arithmetic.arrays import Array, Mask, elementwise
+from starid.arithmetic.elementary import atan2, hypot, log10, power
+from starid.arithmetic.matrices import lengths, product
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
-from starid.elementary import atan2, hypot, log10, power
 from starid.identification.options import RsiOptions
 from starid.identification.single_camera import CheckedDetections, SingleCameraIdentifier
 from starid.identification.solution import FeatureReport, Solution
@@ -35,7 +36,6 @@ from starid.identification.thesis.lsi_identifier import (
 from starid.identification.thesis.parts import Parts
 from starid.identification.thesis.rsi import RsiSettings, region_side
 from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilterSettings, rays
-from starid.matrices import lengths, product
 
 _MIN_MATCHES: Final = 3
 _ENOUGH_MATCHES: Final = 8

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starid.arrays import Array
-from starid.elementary import cos, sin, square
+from starid.arithmetic.arrays import Array
+from starid.arithmetic.elementary import cos, sin, square
 from starid.identification.thesis.cme import CameraMotion
 
 _RA, _DEC, _ROLL, _TURN, _X, _Y = range(6)

@@ -16,14 +16,14 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Mask
+from starid.arithmetic.arrays import Array, Indices, Mask
+from starid.arithmetic.elementary import square
+from starid.arithmetic.matrices import length, lengths, product
 from starid.attitude.wahba import solve_wahba
-from starid.elementary import square
 from starid.identification.thesis.cme import rigid_fit
 from starid.identification.thesis.false_stars import FilterError, FilterResult, ObservedFrame
 from starid.identification.thesis.frame_grid import Geometry
 from starid.identification.thesis.frame_motion import MAX_VOTERS, find_motion, nearest_objects
-from starid.matrices import length, lengths, product
 
 MAX_OBJECTS: Final = 2000
 """Largest number of objects in a frame."""

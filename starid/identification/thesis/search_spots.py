@@ -9,8 +9,8 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from starid.arrays import Array, Indices, elementwise
-from starid.elementary import cos
+from starid.arithmetic.arrays import Array, Indices, elementwise
+from starid.arithmetic.elementary import cos
 from starid.identification.thesis.frame_grid import GridArrays, cell_centre
 from starid.kernels.jit import compiled, inner_checked
 

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starid.arrays import Array, Indices
-from starid.elementary import cos, hypot, sin, square
+from starid.arithmetic.arrays import Array, Indices
+from starid.arithmetic.elementary import cos, hypot, sin, square
 from starid.identification.thesis.cell_search import CellArrays, CellIndex, exact_nearest, stored_neighbours
 from starid.identification.thesis.database import DatabaseError
 from starid.identification.thesis.features import FeatureVector

@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Array32, Indices
+from starid.arithmetic.arrays import Array, Array32, Indices
 from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.neighbours import neighbours_of
 from starid.lab.classic.pairs import chord_between

@@ -21,7 +21,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Array32, Indices, Indices32
+from starid.arithmetic.arrays import Array, Array32, Indices, Indices32
 from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.grid import BUFFER_SHARE, RADIUS_SHARE
 from starid.lab.classic.neighbours import aligned_neighbours, nearest_beyond, neighbour_table

@@ -21,7 +21,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Indices32
+from starid.arithmetic.arrays import Array, Indices, Indices32
 from starid.kernels.jit import compiled_ieee
 from starid.lab.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed

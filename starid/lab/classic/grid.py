@@ -22,7 +22,7 @@ from typing import ClassVar, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices, Indices32
+from starid.arithmetic.arrays import Array, Indices, Indices32
 from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.neighbours import (
     MAX_TIED,

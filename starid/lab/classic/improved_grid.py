@@ -26,7 +26,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arithmetic.arrays import Array, Indices
 from starid.kernels.jit import compiled_ieee
 from starid.lab.classic.grid import (
     BUFFER_SHARE,

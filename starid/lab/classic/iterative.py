@@ -20,7 +20,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Indices32, Mask
+from starid.arithmetic.arrays import Array, Indices, Indices32, Mask
 from starid.kernels.jit import compiled_ieee
 from starid.lab.classic.geometric_voting import votes_of
 from starid.lab.classic.pairs import PairTable, chord_between, pair_range, pair_table

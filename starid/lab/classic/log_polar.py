@@ -24,7 +24,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices, Indices32
+from starid.arithmetic.arrays import Array, Indices, Indices32
 from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.neighbours import MAX_TIED, add_winners, grouped, neighbours_of, turned
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed

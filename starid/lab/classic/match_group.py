@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Indices32
+from starid.arithmetic.arrays import Array, Indices, Indices32
 from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.agreement import group_around
 from starid.lab.classic.pairs import PairTable, chord_between, pair_range, pair_table

@@ -26,7 +26,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices
+from starid.arithmetic.arrays import Array, Indices
 from starid.kernels.jit import compiled_ieee
 from starid.lab.classic.grid import BUFFER_SHARE, GRID, MAX_NEIGHBOURS, RADIUS_SHARE, place_on_grid
 from starid.lab.classic.neighbours import aligned_neighbours

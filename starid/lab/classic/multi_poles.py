@@ -21,7 +21,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arithmetic.arrays import Array, Indices
 from starid.kernels.jit import compiled_ieee
 from starid.lab.classic.neighbours import MAX_TIED, add_winners
 from starid.lab.classic.pairs import PairTable, pair_table, pole_partners

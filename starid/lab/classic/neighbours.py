@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Array32, Indices, Indices32
+from starid.arithmetic.arrays import Array, Array32, Indices, Indices32
 from starid.kernels.jit import compiled_ieee, inner
 
 MAX_TIED: Final = 4

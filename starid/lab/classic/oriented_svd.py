@@ -24,7 +24,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices, Indices32
+from starid.arithmetic.arrays import Array, Indices, Indices32
 from starid.kernels.jit import compiled_ieee
 from starid.lab.classic.neighbours import nearest_beyond, neighbours_of
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed

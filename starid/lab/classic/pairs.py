@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Array32, Indices, Indices32
+from starid.arithmetic.arrays import Array, Array32, Indices, Indices32
 from starid.errors import StaridError
 from starid.kernels.jit import compiled_ieee, inner
 

@@ -22,7 +22,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arithmetic.arrays import Array, Indices
 from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.pairs import PairTable, chord_between, pair_range, pair_table
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed

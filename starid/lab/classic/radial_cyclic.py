@@ -19,7 +19,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices, Indices32
+from starid.arithmetic.arrays import Array, Indices, Indices32
 from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.neighbours import neighbours_of, turned
 from starid.lab.classic.rings import MAX_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_of, ring_table

@@ -24,7 +24,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Array32, Indices, Indices32
+from starid.arithmetic.arrays import Array, Array32, Indices, Indices32
 from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.neighbours import MAX_TIED, add_winners, neighbour_table, neighbours_of, turned
 from starid.lab.classic.rings import RADIUS_SHARE

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices32
+from starid.arithmetic.arrays import Array, Indices32
 from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.neighbours import grouped, neighbours_of
 

@@ -28,7 +28,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices
+from starid.arithmetic.arrays import Array, Indices
 from starid.attitude import Attitude
 from starid.attitude.wahba import covariance, solve_wahba
 from starid.camera import DEFAULT_CAMERA, Camera

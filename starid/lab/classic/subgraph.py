@@ -23,7 +23,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arithmetic.arrays import Array, Indices
 from starid.attitude.wahba import solve_wahba
 from starid.errors import StaridError
 from starid.kernels.jit import compiled_ieee

@@ -23,7 +23,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arithmetic.arrays import Array, Indices
 from starid.kernels.jit import compiled_ieee
 from starid.lab.classic.neighbours import nearest_beyond, neighbours_of
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed

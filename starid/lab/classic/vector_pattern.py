@@ -23,7 +23,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Array32, Indices, Indices32
+from starid.arithmetic.arrays import Array, Array32, Indices, Indices32
 from starid.kernels.jit import compiled_ieee, inner
 from starid.lab.classic.grid import BUFFER_SHARE, MAX_NEIGHBOURS, RADIUS_SHARE, place_on_grid
 from starid.lab.classic.neighbours import (

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.camera import Camera
 from starid.identification.thesis.features import extract_features
 from starid.identification.thesis.metrics import boresight_error

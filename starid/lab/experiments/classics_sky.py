@@ -15,7 +15,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog

@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.identification.thesis.frame_sky import cell_features
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, planar_sky
 from starid.lab.experiments.figures import Panel, Picture, curves_of

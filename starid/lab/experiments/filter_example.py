@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Mask
+from starid.arithmetic.arrays import Array, Mask
 from starid.identification.thesis.cme import matched_motion
 from starid.identification.thesis.false_stars import ObservedFrame
 from starid.identification.thesis.fsf import (

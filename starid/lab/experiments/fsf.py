@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Mask
+from starid.arithmetic.arrays import Mask
 from starid.identification.thesis.cme import CameraMotion, matched_motion
 from starid.identification.thesis.false_stars import ObservedFrame
 from starid.identification.thesis.fsf import ClusterFilter

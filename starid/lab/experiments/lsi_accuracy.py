@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.identification.thesis.metrics import error_colours
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
 from starid.lab.experiments.figures import Picture, precision, precision_axes

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.lab.experiments.experiment import Evaluation
 from starid.lab.experiments.figures import Curve
 from starid.lab.experiments.lsi_trials import GRID_LABELS, OFF, ON, count_label

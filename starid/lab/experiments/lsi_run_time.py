@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.identification.thesis.features import extract_features
 from starid.identification.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
 from starid.identification.thesis.lsi import estimate_from_path, fill_dictionary, lsi_work

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.identification.thesis.cme import matched_motion
 from starid.identification.thesis.database import DatabaseParameters, build_database
 from starid.identification.thesis.false_stars import ObservedFrame

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude, random_attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.identification.thesis.feature_search import FeatureSearch

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.identification.thesis.cme import matched_motion
 from starid.identification.thesis.false_stars import FalseStarFilter, FilterResult
 from starid.identification.thesis.features import extract_features

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.identification.thesis.metrics import boresight_error, rotation_error
 from starid.identification.thesis.rsi import RsiStep
 from starid.lab.simulation import SimulatedFrame

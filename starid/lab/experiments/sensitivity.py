@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.identification.thesis.database import DatabaseParameters, build_database
 from starid.identification.thesis.features import FeatureVector
 from starid.identification.thesis.frame_sky import FrameSky, SkyError

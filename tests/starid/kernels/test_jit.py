@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import starid
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.kernels import kernel_cache
 from starid.kernels.jit import compiled, compiled_ieee, inner, inner_checked
 from starid.storage.cache import cached_files, remove

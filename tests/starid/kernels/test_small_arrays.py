@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 from starid.kernels.jit import compiled_ieee
 from starid.kernels.small_arrays import lower_median, median
 

@@ -33,7 +33,7 @@ def record_type(form: type) -> np.dtype[np.void]:
 
 
 def elementwise(function: Callable[..., float], *arrays: ArrayLike) -> Array:
-    """Return a function of `starid.elementary` for each element of arrays of equal shape."""
+    """Return a function of `starid.arithmetic.elementary` for each element of arrays of equal shape."""
     tables = [np.asarray(each, np.float64) for each in arrays]
     values = map(function, *(each.ravel().tolist() for each in tables))
     return np.fromiter(values, np.float64, tables[0].size).reshape(tables[0].shape)

@@ -2,8 +2,8 @@
 
 The last bit of ``sin``, ``exp``, ``hypot`` … depends on the C library, on whether it may fuse multiplication and addition, and, in
 numpy, on the width of vectors. These functions use only operations whose results IEEE 754 defines to the last bit: + − × ÷, square
-root, and scaling by powers of two. All that a telemetry value depends on is computed with them (`starid.matrices` for products of
-matrices); a test names the modules and forbids the other functions there.
+root, and scaling by powers of two. All that a telemetry value depends on is computed with them (products of matrices:
+`starid.arithmetic.matrices`); a test names the modules and forbids the other functions there.
 
 They are plain Python; `starid.kernels.jit` lets kernels compile the same text. Errors, in units in the last place: below 1 for
 ``sin``, ``cos``, ``exp`` and ``log``, below 2 for the others, where no error is given. Arguments are finite; beyond 10⁶, an angle counts

@@ -1,7 +1,7 @@
 """Small matrices by sums in a stated order: the same bytes on each processor.
 
 The order of the sums in BLAS and LAPACK (``@``, ``numpy.linalg``) and in ``numpy.einsum`` depends on the processor, as does whether
-they fuse multiplication and addition. See `starid.elementary`.
+they fuse multiplication and addition. See `starid.arithmetic.elementary`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array
+from starid.arithmetic.arrays import Array
 
 _MAX_SWEEPS: Final = 30
 _ZERO_SHARE: Final = 1e-14

@@ -1,0 +1,1 @@
+"""Arrays and the arithmetic on them whose results are the same bytes on each processor."""
