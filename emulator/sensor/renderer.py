@@ -12,35 +12,29 @@ import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.fixed_pattern import FixedPattern, make_fixed_pattern
-from starhil.emulator.sensor.model import SOLAR_COLOUR_B_V, SensorModel
+from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.noise import digitize
 from starhil.emulator.sensor.particle_hits import add_protons
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.rolling_shutter import at_row_times
 from starhil.emulator.sensor.sky.area_light import AreaLight, Backdrop
-from starhil.emulator.sensor.sky.catalog_errors import as_in_the_sky
 from starhil.emulator.sensor.sky.ephemeris import Observer
 from starhil.emulator.sensor.sky.light import AreaPainter
 from starhil.emulator.sensor.sky.objects import PointSource, SkyObjects
+from starhil.emulator.sensor.sky.stars import SkyStars
 from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask
 from starid.arithmetic.elementary import acos, cos, square
 from starid.arithmetic.matrices import length, lengths, product
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
-from starid.catalog.catalog import companions
 from starid.catalog.photometry import flux_ratio
-from starid.catalog.variable_stars import BRIGHTEST, HIP, variable_magnitudes
 
 __all__ = ["Frame", "Renderer", "SensorModel", "StarTruth", "render"]
 
 _MAX_RATE_RAD_S: Final = 20.0
 _VISIBLE_SHARE: Final = 0.5
-_COMPANION_RAD: Final = math.radians(1.0)
-"""Largest distance of a companion: with coarser pixels it would take minutes to find them all."""
-_COMPANION_PX: Final = 2.0
 _OBJECT_STREAM: Final = 2
-_CATALOG_STREAM: Final = 3
 _FLOOD_WELLS: Final = 10.0
 """Full wells of electrons in every pixel when light passes the baffle."""
 
@@ -153,25 +147,7 @@ class Renderer:
         self.seed = _whole_number("seed", seed)
         self.objects = objects
         self._painter = AreaPainter(camera, self.sensor.zero_magnitude_e_s, self.sensor.psf_sigma_px)
-        colour = np.nan_to_num(catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
-        brightness = np.asarray(catalog.v - self.sensor.colour_term * colour, dtype=np.float64)
-        limit = self.sensor.limiting_magnitude
-        varying = np.flatnonzero(np.isin(catalog.hip, HIP[limit >= BRIGHTEST]))
-        near = companions(catalog, limit, min(_COMPANION_PX * camera.pixel_scale_rad, _COMPANION_RAD))
-        rows = np.unique(np.concatenate([np.flatnonzero(catalog.v <= limit), near, varying]))
-        self._rows = rows[np.argsort(brightness[rows], kind="stable")]
-        self._vectors = np.ascontiguousarray(catalog.vectors[self._rows])
-        parallax_mas = np.maximum(np.nan_to_num(catalog.parallax_mas[self._rows]), 0.0)
-        self._parallax_rad = np.radians(parallax_mas / 3.6e6)
-        self._flux_e_s = self.sensor.zero_magnitude_e_s * flux_ratio(brightness[self._rows])
-        hip = catalog.hip[self._rows]
-        number = np.flatnonzero(np.isin(HIP, hip))
-        where = np.array([np.flatnonzero(hip == each)[0] for each in HIP[number]], dtype=np.int64)
-        self._varying = number, where, catalog.v[self._rows[where]].astype(np.float64)
-        """Of the variable stars: their number in `VARIABLE_STARS`, their rows, and V in the catalogue."""
-        self._only_at_maximum = where[(self._varying[2] > limit) & ~np.isin(self._rows[where], near)]
-        """Rows of variable stars that are within the limit only at their maximum."""
-        self._sky_stars: tuple[tuple[object, ...], Array, Array] = ((), self._vectors, np.ones(0))
+        self._stars = SkyStars(catalog, self.sensor, camera.pixel_scale_rad, seed)
         self._cos_cone = cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
         pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
         self._pattern = _vignetted(pattern, camera, self.sensor.vignetting)
@@ -220,12 +196,12 @@ class Renderer:
         mean = self._mean_without_stars(exposure, temperature, area)
         self._pattern.telegraph.add(mean, index, exposure * sensor.dark_factor(temperature))
         planets = () if others is None else others.planets
-        vectors, flux_e_s = self._as_in_the_sky(others, observer)
+        vectors, flux_e_s = self._stars.shown(others, observer)
         path, sources, inside = self._paths(
             vectors, flux_e_s > 0.0, optical_axis, rate, exposure, observer, planets
         )
-        count = int(np.count_nonzero(sources < len(self._rows)))
-        magnitudes = [planets[number - len(self._rows)].magnitude for number in sources[count:]]
+        count = int(np.count_nonzero(sources < len(self._stars)))
+        magnitudes = [planets[number - len(self._stars)].magnitude for number in sources[count:]]
         planets_e = [self.sensor.electrons(magnitude, exposure) for magnitude in magnitudes]
         electrons = np.concatenate([flux_e_s[sources[:count]] * exposure, planets_e])
         drawn, lit, centred = electrons, path, np.flatnonzero(inside[:count])
@@ -237,7 +213,7 @@ class Renderer:
                 drawn *= area.seen_at(path[:, :2])
             planet_xy = np.full((len(planets), 2), np.nan)
             shown = count + np.flatnonzero(inside[count:])
-            planet_xy[sources[shown] - len(self._rows)] = path[shown, :2]
+            planet_xy[sources[shown] - len(self._stars)] = path[shown, :2]
             rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
             false_xy = self._add_false_stars(mean, others, rng, exposure)
             lit, drawn = _disturbed(path, drawn, others, rng)
@@ -248,7 +224,7 @@ class Renderer:
             object_truth = ObjectTruth(false_xy, planet_xy, tracks, area.covered_share if area else 0.0)
         self._add_light(mean, lit, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
-        rows = self._rows[sources[centred]]
+        rows = self._stars.rows[sources[centred]]
         stars = StarTruth(
             self.catalog.hip[rows],
             rows.astype(np.int64),
@@ -308,40 +284,6 @@ class Renderer:
             area.draw(self._work, backdrop)
         return self._work
 
-    def _as_in_the_sky(self, objects: SkyObjects | None, observer: Observer | None) -> tuple[Array, Array]:
-        """Return directions (n, 3) and electrons/s (n,) of the stars.
-
-        They differ from the catalogue's by its errors, and at a date by the variable stars.
-        """
-        vectors, flux_e_s = self._with_catalog_errors(objects)
-        number, rows, in_catalog = self._varying
-        if not rows.size:
-            return vectors, flux_e_s
-        flux_e_s = flux_e_s.copy()
-        if observer is None:
-            flux_e_s[self._only_at_maximum] = 0.0
-        else:
-            fainter = variable_magnitudes(observer.unix_s)[number] - in_catalog
-            flux_e_s[rows] *= flux_ratio(fainter)
-        return vectors, flux_e_s
-
-    def _with_catalog_errors(self, objects: SkyObjects | None) -> tuple[Array, Array]:
-        """Return directions (n, 3) and electrons/s (n,) of the stars, with the catalogue's errors against the sky."""
-        if objects is None:
-            return self._vectors, self._flux_e_s
-        errors = (
-            objects.catalog_position_error_arcsec,
-            objects.catalog_magnitude_error,
-            objects.catalog_errors,
-        )
-        if not any(errors):
-            return self._vectors, self._flux_e_s
-        if self._sky_stars[0] != errors:
-            rng = np.random.default_rng((self.seed, _CATALOG_STREAM))
-            vectors, fainter = as_in_the_sky(self.catalog.hip[self._rows], self._vectors, *errors, rng)
-            self._sky_stars = errors, vectors, flux_ratio(fainter)
-        return self._sky_stars[1], self._flux_e_s * self._sky_stars[2]
-
     def _paths(
         self,
         vectors: Array,
@@ -361,13 +303,11 @@ class Renderer:
         sweep = length(rate) * (exposure_s + readout_s)
         cosine = cos(min(acos(self._cos_cone) + sweep, math.pi))
         near = np.flatnonzero((product(vectors, attitude.boresight) >= cosine) & shine)
-        icrs = vectors[near]
-        if observer is not None:
-            icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
+        icrs = self._stars.apparent(vectors, near, observer)
         if planets:
             vectors = np.array([planet.direction for planet in planets])
             icrs = np.concatenate([icrs, vectors])
-            near = np.concatenate([near, len(self._rows) + np.arange(len(planets))])
+            near = np.concatenate([near, len(self._stars) + np.arange(len(planets))])
         path, inside, touching = self._path_of(icrs, attitude, rate, exposure_s)
         return path[touching], near[touching], inside[touching]
 
