@@ -137,7 +137,8 @@ class McapRecorder:
         """Writes that were dropped because the disk was too slow."""
         self._task: asyncio.Task[None] | None = None
         self._stream = _Records()
-        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        stream: Any = self._stream
+        self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library="starhil")
         self.file = OutputFile(
             "recording", path, header=self._stream.take(), tail=_END_WITHOUT_INDEX, overwrite=overwrite

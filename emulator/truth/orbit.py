@@ -157,8 +157,8 @@ class TleOrbit:
                 raise EmulatorError(
                     f"orbit: line {number} of the TLE is invalid; it must begin with {number} and have {TLE_LENGTH} characters"
                 )
-        for name, (line, columns, point, low, high) in TLE_FIELDS.items():
-            text = (line1, line2)[line][columns]
+        for name, (row, columns, point, low, high) in TLE_FIELDS.items():
+            text = (line1, line2)[row][columns]
             try:
                 valid = low <= read_number(point + text.strip()) <= high
             except ValueError:
