@@ -137,18 +137,6 @@ def test_a_header_that_cannot_be_read_is_rejected(run, headers, status):
     run(scenario, options=OPTIONS)
 
 
-def test_a_request_with_more_headers_than_a_browser_sends_is_rejected(run):
-    async def scenario(emulation, _line):
-        address = emulation.ready_fields["view"]
-        async with aiohttp.ClientSession() as session:
-            for count, status in ((40, 200), (70, 400)):
-                headers = {f"X-{number}": "x" for number in range(count)}
-                async with session.get(address, headers=headers) as answer:
-                    assert answer.status == status
-
-    run(scenario, options=OPTIONS)
-
-
 def test_a_page_that_closes_before_it_is_answered_leaves_no_error_in_the_log(run, caplog):
     async def scenario(emulation, _line):
         host, path = emulation.ready_fields["view"].removeprefix("http://").split("/")
