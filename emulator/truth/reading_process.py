@@ -18,8 +18,10 @@ import select
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import astuple
 from pathlib import Path
 from types import SimpleNamespace
@@ -48,8 +50,13 @@ SILENT_S: Final = 30
 """Time for which nothing of a file is read, seconds, after which it never will be: it names a pipe, or its folder is on a
 network whose server does not answer."""
 
-LOOK_S: Final = 0.5
+LOOK_S: Final = 0.1
 """Interval at which a process is looked at, seconds."""
+
+MAX_PROCESSES: Final = 4
+"""Number of processes that read at a time; those that nobody waits for any more make room within `LOOK_S`."""
+
+_ROOM: Final = threading.BoundedSemaphore(MAX_PROCESSES)
 
 NICENESS: Final = 15
 """Priority of the process, so that the bus and the pipeline are served first."""
@@ -112,11 +119,9 @@ def _spans(content: dict[str, Any]) -> list[Span]:
 
 def _read_apart(kind: Kind, path: Path) -> tuple[dict[str, Any], list[Any]]:
     """Return what another process reads of a file."""
-    command = [sys.executable, "-P", "-m", __name__, kind, str(path), str(os.getpid())]
-    with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as process:  # noqa: S603
+    with _process(kind, path) as process:
         if process.stdout is None:
             raise RuntimeError("no pipe")
-        os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
         why = ""
         try:
             why = _wait_for_content(process.pid, process.stdout)
@@ -140,6 +145,24 @@ def _read_apart(kind: Kind, path: Path) -> tuple[dict[str, Any], list[Any]]:
     how = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
     why = why or f"the process that reads it has ended {how}"
     raise EmulatorError(f"{kind} file {path}: cannot be read ({why})")
+
+
+@contextmanager
+def _process(kind: Kind, path: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Start a process that reads a file, at a low priority, when there is room for one."""
+    begin_s = time.monotonic()
+    while not _ROOM.acquire(timeout=LOOK_S):
+        if is_abandoned() or time.monotonic() - begin_s > SILENT_S:
+            raise EmulatorError(
+                f"{kind} file {path}: cannot be read ({MAX_PROCESSES} files are being read already)"
+            )
+    try:
+        command = [sys.executable, "-P", "-m", __name__, kind, str(path), str(os.getpid())]
+        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as process:  # noqa: S603
+            os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
+            yield process
+    finally:
+        _ROOM.release()
 
 
 def _silent() -> str:

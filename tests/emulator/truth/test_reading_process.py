@@ -20,7 +20,13 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth import reading_process
 from starhil.emulator.truth.file import read_orbit_file, read_truth_file
-from starhil.emulator.truth.reading_process import AT_ONCE_BYTES, read_orbit, read_truth
+from starhil.emulator.truth.reading_process import (
+    AT_ONCE_BYTES,
+    LOOK_S,
+    MAX_PROCESSES,
+    read_orbit,
+    read_truth,
+)
 from starhil.hil_tests.rig.emulator_process import installed_command
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.truth.test_standard_files import aem
@@ -271,6 +277,27 @@ def test_what_reads_a_file_yields_to_the_run_and_ends_when_nobody_waits(tmp_path
         assert os.getpriority(os.PRIO_PROCESS, reader) > os.getpriority(os.PRIO_PROCESS, 0)
         reading.cancel()
         await until(lambda: not is_alive(reader))
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.process
+def test_a_limited_number_of_processes_reads_at_a_time(tmp_path: Path) -> None:
+    """Each truth that replaced another before its file was read could have started one more."""
+    path = meta_kernel_of_a_pipe(tmp_path)
+
+    async def scenario() -> None:
+        reading = [asyncio.create_task(in_thread(read_truth, path)) for _ in range(MAX_PROCESSES + 3)]
+        await until(lambda: len(readers_of(os.getpid())) == MAX_PROCESSES)
+        await asyncio.sleep(2 * LOOK_S)
+        first = readers_of(os.getpid())
+        assert len(first) == MAX_PROCESSES
+        for task in reading[:MAX_PROCESSES]:
+            task.cancel()
+        await until(lambda: {*readers_of(os.getpid())} - {*first})
+        for task in reading:
+            task.cancel()
+        await until(lambda: not readers_of(os.getpid()))
 
     asyncio.run(scenario())
 
