@@ -1,6 +1,7 @@
 """Stars, timing and the rate of frames."""
 
 import struct
+from itertools import pairwise
 
 import pytest
 
@@ -210,3 +211,19 @@ def test_cubestar_processes_an_image_while_it_takes_the_next_one_as_in_erlanks_t
     assert 1.0 - 0.15 < latency_s < 1.0 - 0.15 + 0.388 + 0.005
     assert latency_s == pytest.approx(1.238, abs=0.005)
     assert bench.read("precise_attitude")["reason"] == "ok"
+
+
+def test_an_afterimage_lasts_from_exposure_to_exposure_until_the_pipeline_is_started_again(bench):
+    """The begins are those of the exposures, not of their results, and a rehearsal, which nobody counts, has none."""
+    assert bench.device.cycle.rehearsal({}).rehearsal.begin_s is None
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(4.0)
+    first = bench.pipeline.frames[-3:]
+    period_s, exposure_s = 1.0 / bench.device.parameters["update_rate"], bench.device.cycle.exposure_s
+    begins = [frame.begin_s for frame in first]
+    assert [after - before for before, after in pairwise(begins)] == pytest.approx([period_s] * 2)
+    assert bench.clock.now_ns() / 1e9 - begins[-1] < period_s + exposure_s
+    assert {frame.pipeline_starts for frame in first} == {1}
+    bench.device.pipeline_ready({})
+    bench.step(2.0)
+    assert bench.pipeline.frames[-1].pipeline_starts == 2
