@@ -11,6 +11,8 @@ from typing import Final
 
 FONT_PT: Final = 8.0
 _IMAGE: Final = re.compile(r'(<img src=")([\w.-]+)(")')
+_MARKS: Final = re.compile(r"[!-/:-@\[-`{-~]")
+"""Characters that Markdown may take for marks, and a backslash makes plain."""
 _EMPHASIS: Final = re.compile(r"</?(?:em|strong|code)>")
 """Tags that fpdf2 does not end within the cell of a table."""
 _STYLE: Final = """
@@ -21,10 +23,22 @@ th { background: #eef1f5; } img { max-width: 100%; } code { background: #eef1f5;
 """
 
 
+def plain(text: str) -> str:
+    """Return Markdown that shows a user's text as it is, also in a table."""
+    return _MARKS.sub(r"\\\g<0>", " ".join(text.split()))
+
+
+def code(text: str) -> str:
+    """Return Markdown that shows a user's text as code, also in a table."""
+    runs = [len(run) for run in re.findall("`+", text)]
+    fence, gap = "`" * (1 + max(runs, default=0)), " " if runs else ""
+    return f"{fence}{gap}{' '.join(text.split())}{gap}{fence}".replace("|", r"\|")
+
+
 def _body(markdown: str) -> str:
     from markdown_it import MarkdownIt
 
-    body: str = MarkdownIt("commonmark").enable("table").render(markdown)
+    body: str = MarkdownIt("commonmark", {"html": False}).enable("table").render(markdown)
     return body
 
 

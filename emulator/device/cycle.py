@@ -28,6 +28,7 @@ from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming
 from starhil.emulator.device.signals import Signals
 from starhil.emulator.device.surroundings import Surroundings
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
 from starhil.emulator.sensor.pipeline.client import PipelineClient, PipelineReply
 from starhil.emulator.sensor.pipeline.messages import (
@@ -57,6 +58,9 @@ Argument = TypeVar("Argument")
 
 MAX_PENDING: Final = 2
 """Number of pending requests at which exposures are skipped; more if more fit into the modelled time."""
+
+MAX_AWAITED: Final = 256
+"""Largest number of actions that await a phase of the next exposure, of which there may be none for any time."""
 
 LONGEST_GAP_PERIODS: Final = 2.5
 """Longest gap between two attitudes from which a rate is estimated, update periods."""
@@ -180,8 +184,16 @@ class FrameCycle:
         self.published = self.skipped = 0
         self.upsets = self._stored_upsets
 
+    def check_awaits(self) -> None:
+        """Check that one more action can await a phase."""
+        if len(self._awaiting) >= MAX_AWAITED:
+            raise EmulatorError(
+                f"phase: {MAX_AWAITED} requests await the next exposure already, and none has begun (mode {self._modes.mode.value})"
+            )
+
     def at_phase(self, phase: Phase, action: Action) -> None:
-        """Do something once, at a phase of the next exposure that begins."""
+        """Do something once, at a phase of the next exposure that begins; EmulatorError if too much awaits one."""
+        self.check_awaits()
         self._awaiting.append((phase, action))
 
     def retime(self) -> None:

@@ -239,6 +239,8 @@ class Faults:
 
     def check(self, request: FaultRequest) -> None:
         """Check that the faults of a request can be injected."""
+        if request.phase is not None:
+            self._device.cycle.check_awaits()
         if request.device is not None:
             for key, effect, value in _values(request.device):
                 if effect.enum and value not in (known := effect.names(self._device.icd)):

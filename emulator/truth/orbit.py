@@ -17,6 +17,7 @@ from starid.arithmetic.arrays import Array, on_grid
 from starid.arithmetic.elementary import acos, atan2, cos, hypot, sin, square
 from starid.arithmetic.matrices import dot, length, product
 from starid.catalog.earth import DAY_S, UNIX_EPOCH_JD, VELOCITY_GRID_M_S, terrestrial_time
+from starid.storage.files import read_number
 
 Vector: TypeAlias = Array
 
@@ -26,6 +27,17 @@ EARTH_J2: Final = 1.082_626_68e-3
 
 LARGEST_ECCENTRICITY: Final = 0.995
 TLE_LENGTH: Final = 69
+TLE_FIELDS: Final = {
+    "day of the epoch": (0, slice(20, 32), "", 1.0, 367.0),
+    "inclination": (1, slice(8, 16), "", 0.0, 180.0),
+    "right ascension of the node": (1, slice(17, 25), "", 0.0, 360.0),
+    "eccentricity": (1, slice(26, 33), "0.", 0.0, 1.0),
+    "argument of perigee": (1, slice(34, 42), "", 0.0, 360.0),
+    "mean anomaly": (1, slice(43, 51), "", 0.0, 360.0),
+    "mean motion": (1, slice(52, 63), "", 0.01, 20.0),
+}
+"""Numbers of a TLE that the checksum does not judge: line, columns, what precedes the number, and its range."""
+
 _KEPLER_STEPS: Final = 60
 _POSITION_GRID_M: Final = 2.0**-10
 
@@ -145,6 +157,16 @@ class TleOrbit:
                 raise EmulatorError(
                     f"orbit: line {number} of the TLE is invalid; it must begin with {number} and have {TLE_LENGTH} characters"
                 )
+        for name, (row, columns, point, low, high) in TLE_FIELDS.items():
+            text = (line1, line2)[row][columns]
+            try:
+                valid = low <= read_number(point + text.strip()) <= high
+            except ValueError:
+                valid = False
+            if not valid:
+                raise EmulatorError(
+                    f"orbit: TLE: {name} must be a number from {low:g} to {high:g}, not {text!r}; copy both lines again"
+                )
         try:
             verify_checksum(line1, line2)
             self._satellite: Any = Satrec.twoline2rv(line1, line2)
@@ -169,6 +191,8 @@ class TleOrbit:
         c, s = cos(equinoxes), sin(equinoxes)
         to_gcrs = product(erfa.pnm00b(*tt).T, np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
         position, velocity = (product(to_gcrs, 1e3 * np.array(each)) for each in (position_km, velocity_km_s))
+        if not np.isfinite([position, velocity]).all():
+            raise EmulatorError("orbit: TLE: has no position at the run's date; give a current TLE")
         return OrbitState(on_grid(position, _POSITION_GRID_M), on_grid(velocity, VELOCITY_GRID_M_S))
 
 
