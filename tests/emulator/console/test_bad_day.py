@@ -286,7 +286,11 @@ def test_more_messages_than_anyone_can_read_are_put_on_the_page_once_a_second(br
             }"""
         )
         page.locator("#wire .trace li", has_text="turn 30").first.wait_for()
+        shown = page.locator("#wire .trace li", has_text="turn").count()
+        page.locator("#wire input[type=search]").fill("turn")
+        kept = page.locator("#wire .trace li", has_text="turn").count()
     assert 1 <= renderings <= 4
+    assert shown < kept == 400
 
 
 def test_paused_is_paused_everywhere_and_arrows_on_a_tab_change_the_tab(page):
