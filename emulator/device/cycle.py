@@ -131,6 +131,8 @@ class FrameCycle:
         """Bits flipped in the star catalogue since start-up."""
         self._stored_upsets: tuple[CatalogUpset, ...] = ()
         """Those flipped where the catalogue is stored, which a restart does not undo."""
+        self.pipeline_starts = 0
+        """How often the pipeline has been started."""
         self.index = 0
         """Index of the next exposure; never reset, so that no two exposures have the same noise."""
         self.published = 0
@@ -267,7 +269,7 @@ class FrameCycle:
         truth = self._surroundings.state(mid_ns)
         predicted = self._predict(mid_ns) if mode is Mode.TRACKING else None
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
-        request = self._request(truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
+        request = self._request(start_ns, truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
         if predicted is not None and self._parameters["prediction_enable"]:
             error = self._history.covariance(mid_ns)
             request = replace(request, prediction_covariance=error, predicted_rate_rad_s=self._history.rate())
@@ -316,10 +318,13 @@ class FrameCycle:
 
     def single_frame(self, mid_ns: int) -> FrameRequest:
         """Return the request for an exposure that is not solved, with a given simulation time of mid-exposure."""
-        return self._request(self._surroundings.state(mid_ns), self.exposure_s, None, None, solve=False)
+        exposure_s = self.exposure_s
+        start_ns = mid_ns - round(exposure_s * NANOSECONDS / 2)
+        return self._request(start_ns, self._surroundings.state(mid_ns), exposure_s, None, None, solve=False)
 
     def _request(
         self,
+        start_ns: int,
         truth: TruthState,
         exposure_s: float,
         predicted: Attitude | None,
@@ -345,6 +350,8 @@ class FrameCycle:
             particles_s=conditions.particles_s,
             upsets=self.upsets,
             observer_velocity=velocity,
+            begin_s=start_ns / NANOSECONDS,
+            pipeline_starts=self.pipeline_starts,
         )
 
     def _predict(self, mid_ns: int) -> Attitude | None:

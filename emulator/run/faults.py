@@ -247,6 +247,11 @@ class Faults:
                     near = did_you_mean(value, known)
                     raise EmulatorError(f"device.{key}: {value!r} is not one of {', '.join(known)}{near}")
                 effect.check(self._device, value)
+        satellites = (request.optical or {}).get("satellites")
+        if satellites is not None and not self._device.surroundings.has_orbit:
+            raise EmulatorError(
+                "optical.satellites: they are seen from an orbit; start the run with one, such as --orbit leo"
+            )
         shown = {name: link.shown_in_replies for name, link in self._links.items()}
         for fault in request.telemetry or ():
             self._telemetry.check(fault, shown)
