@@ -36,7 +36,7 @@ from starhil.emulator.benchmarks.ecss_errors import (
     thermo_elastic_error,
 )
 from starhil.emulator.benchmarks.ecss_requirements import Figure, Requirement
-from starhil.emulator.benchmarks.report_files import as_html, as_pdf
+from starhil.emulator.benchmarks.report_files import as_html, as_pdf, code, plain
 from starhil.emulator.sensor.model import SensorModel
 from starid.storage.files import write_atomically
 from starid.storage.results import Results
@@ -263,12 +263,12 @@ def subject(plan: EcssPlan) -> dict[str, str]:
     profile, parameters, camera = plan.device()
     text = json.dumps(profile.model_dump(mode="json"), sort_keys=True)
     return {
-        "profile": f"`{plan.profile}`{''.join(f', `{item}`' for item in plan.overrides)}",
+        "profile": ", ".join(map(code, (plan.profile, *plan.overrides))),
         "checksum of the profile": f"SHA-256 {hashlib.sha256(text.encode()).hexdigest()[:16]}…",
         "camera": f"{camera.width} × {camera.height} pixels, {camera.fov_deg:.4g}° wide; focal length {camera.focal_px[0]:.5g} pixels",
         "aperture": f"{1000.0 * SensorModel().with_(**profile.sensor).aperture_m:.3g} mm",
         "exposure": f"{parameters['exposure']:g} ms, gain {parameters['analog_gain']:g}",
-        "unit": profile.unit_source,
+        "unit": plain(profile.unit_source),
         "version": f"starhil {version('starhil')}",
         "seed": str(plan.seed),
     }
@@ -382,7 +382,8 @@ def as_markdown(
         influences=INFLUENCES,
         normal=NORMAL_SHARES,
         verdicts=[(item, report.named_figures()[item.figure]) for item in requirements],
-        subject={**subject(report.plan), "date": f"{datetime.now(UTC):%Y-%m-%d}", "command": f"`{command}`"},
+        subject={**subject(report.plan), "date": f"{datetime.now(UTC):%Y-%m-%d}", "command": code(command)},
+        plain=plain,
         size=_size,
         plots={plot: PLOTS[plot] for plot in plots},
         error_row=_error_row,
@@ -480,7 +481,7 @@ def _plot_errors(report: EcssReport, folder: Path) -> Path:
     axes.set_yticks(heights, [line.name for line in shown])
     axes.invert_yaxis()
     axes.set_xlabel(f"arcseconds at {100 * report.confidence:g} %")
-    axes.set_title(f"Attitude errors of {report.plan.profile}")
+    axes.set_title(f"Attitude errors of {report.plan.profile}", parse_math=False)
     axes.legend()
     return folder / save(fig, folder / "ecss-errors.png")
 
@@ -508,5 +509,5 @@ def _plot_availability(report: EcssReport, folder: Path) -> Path:
     axes.flat[0].legend()
     for row in axes:
         row[0].set_ylabel("% of frames")
-    fig.suptitle(f"Probability of a correct and a wrong attitude, {report.plan.profile}")
+    fig.suptitle(f"Probability of a correct and a wrong attitude, {report.plan.profile}", parse_math=False)
     return folder / save(fig, folder / "ecss-availability.png")

@@ -123,7 +123,13 @@ def measure_bodies(
         state = _ORBIT.state(unix_s)
         marks = [time.thread_time()]
         view = sky.view(unix_s, state.position_m, state.velocity_m_s)
-        frame = renderer.render(attitude, frame_index=index, objects=view.objects, observer=view.observer)
+        frame = renderer.render(
+            attitude,
+            frame_index=index,
+            objects=view.objects,
+            observer=view.observer,
+            satellites=view.satellites,
+        )
         bodies_in_field(view.objects, attitude, camera)
         marks.append(time.thread_time())
         found = detect(frame.image, settings)

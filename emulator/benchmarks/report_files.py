@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import Final
 
 FONT_PT: Final = 8.0
+CELL_PADDING_MM: Final = 0.4
 _IMAGE: Final = re.compile(r'(<img src=")([\w.-]+)(")')
+_MARKS: Final = re.compile(r"[!-/:-@\[-`{-~]")
+"""Characters that Markdown may take for marks, and a backslash makes plain."""
 _EMPHASIS: Final = re.compile(r"</?(?:em|strong|code)>")
 """Tags that fpdf2 does not end within the cell of a table."""
 _STYLE: Final = """
@@ -21,10 +24,22 @@ th { background: #eef1f5; } img { max-width: 100%; } code { background: #eef1f5;
 """
 
 
+def plain(text: str) -> str:
+    """Return Markdown that shows a user's text as it is, also in a table."""
+    return _MARKS.sub(r"\\\g<0>", " ".join(text.split()))
+
+
+def code(text: str) -> str:
+    """Return Markdown that shows a user's text as code, also in a table."""
+    runs = [len(run) for run in re.findall("`+", text)]
+    fence, gap = "`" * (1 + max(runs, default=0)), " " if runs else ""
+    return f"{fence}{gap}{' '.join(text.split())}{gap}{fence}".replace("|", r"\|")
+
+
 def _body(markdown: str) -> str:
     from markdown_it import MarkdownIt
 
-    body: str = MarkdownIt("commonmark").enable("table").render(markdown)
+    body: str = MarkdownIt("commonmark", {"html": False}).enable("table").render(markdown)
     return body
 
 
@@ -58,6 +73,7 @@ def as_pdf(markdown: str, title: str, folder: Path) -> bytes:
     heading = partial(TextStyle, "report", "B", color=(20, 40, 80), t_margin=4, b_margin=2)
     body = _IMAGE.sub(lambda image: f'{image[1]}{folder / image[2]}" width="520{image[3]}', _body(markdown))
     body = _EMPHASIS.sub("", body).replace("<td>", '<td align="left">').replace("<th>", '<th align="left">')
+    body = body.replace("<table>", f'<table cellpadding="{CELL_PADDING_MM}">')
     pdf.write_html(
         body,
         font_family="report",
@@ -65,6 +81,7 @@ def as_pdf(markdown: str, title: str, folder: Path) -> bytes:
         tag_styles={
             "h1": heading(font_size_pt=16),
             "h2": heading(font_size_pt=11),
+            "p": TextStyle("report", font_size_pt=FONT_PT, t_margin=1, b_margin=2),
             "li": TextStyle("report", font_size_pt=FONT_PT, l_margin=4),
         },
     )

@@ -162,11 +162,11 @@ def frame(
     """Measure the processor time to render, detect and identify an image on one core."""
     from starhil.emulator.benchmarks.frame import measure_bodies, measure_frames
 
-    rows: list[Any]
-    if bodies:
-        rows = measure_bodies(frames, seed, progress())
-    else:
-        rows = measure_frames(frames, seed, rate, progress=progress())
+    rows: list[Any] = (
+        measure_bodies(frames, seed, progress())
+        if bodies
+        else measure_frames(frames, seed, rate, progress=progress())
+    )
     if as_json:
         print(json.dumps({"seed": seed, "rows": _dicts(rows)}))
     else:

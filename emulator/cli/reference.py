@@ -20,7 +20,7 @@ import re
 import textwrap
 from collections.abc import Callable, Container, Iterator, Mapping
 from itertools import groupby
-from typing import Any, Final, get_args
+from typing import Any, Final, get_args, get_origin, get_type_hints
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -293,6 +293,8 @@ def sensor() -> str:
 def sky() -> str:
     """Keys of `[sky]` and of the tables in it."""
     from starhil.emulator.sensor.sky.objects import (
+        CatalogError,
+        Constellation,
         EarthLimb,
         Moon,
         Obstruction,
@@ -306,11 +308,14 @@ def sky() -> str:
         "sun": SunGlare,
         "earth": EarthLimb,
         "planets": PointSource,
+        "satellites": Constellation,
         "obstructions": Obstruction,
+        "catalog_errors": CatalogError,
     }
+    hints = get_type_hints(SkyObjects)
     parts = [table(dataclass_rows(SkyObjects, skipped=bodies))]
     for name, body in bodies.items():
-        listed = name.endswith("s")
+        listed = get_origin(hints[name]) is tuple
         head = f"### `[[sky.{name}]]`" if listed else f"### `[sky.{name}]`"
         about = plain_text((body.__doc__ or "").partition("\n\n")[0])
         parts.append(f"{head}\n\n{about}\n\n{table(dataclass_rows(body))}")

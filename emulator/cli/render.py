@@ -146,6 +146,7 @@ def command(
         Attitude.from_radec_roll(pointing.ra, pointing.dec, pointing.roll),
         [math.radians(value) for value in pointing.rate],
         observer=sky.observer,
+        satellites=sky.satellites,
     )
     write_image(output, _marked(frame) if as_annotated else frame.image)
     if as_json:

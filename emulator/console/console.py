@@ -39,8 +39,8 @@ from starid.errors import StaridError
 
 log = logging.getLogger("starhil.console")
 
-TURN_S: Final = 0.1
-"""Interval at which the trace is sent to pages, seconds."""
+DECODE_S: Final = 0.1
+"""Interval at which new traffic is decoded while a page shows it, seconds."""
 
 STATUS_S: Final = 0.5
 """Interval at which the status of the run is reported, seconds."""
@@ -262,17 +262,12 @@ class Console:
         return self._run.clock.now_ns() / NANOSECONDS
 
     async def _deliver_trace(self) -> None:
-        """Decode new traffic while a page shows it, some items at a time."""
-        await asyncio.sleep(TURN_S)
+        """Decode new traffic while a page shows it, some items at a time; the next turn of the page has them."""
+        await asyncio.sleep(DECODE_S)
         if not any(viewer.wire for viewer in self.viewers):
             return
-        before = self.trace.end
         while self.trace.decode():
             await asyncio.sleep(0)
-        if self.trace.end != before:
-            for viewer in self.viewers:
-                if viewer.wire:
-                    viewer.wake()
 
     async def _report_status(self) -> None:
         await self._status_due.wait()

@@ -21,7 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Final
 
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
 from starhil.emulator.console.events import EventLog, RunEvent
 from starhil.emulator.console.history import COLUMNS, MODES, UNITS, History, Numbers, json_row
@@ -39,6 +39,9 @@ log = logging.getLogger("starhil.record")
 
 MAX_PENDING: Final = 64
 """Write-queue limit; further messages are dropped."""
+
+CHUNK_BYTES: Final = 1 << 18
+"""Size of the chunks in which messages are compressed and written; the last one is lost if the run is killed."""
 
 MCAP_TIMES_NS: Final = range(1 << 64)
 """Times that an MCAP file can hold: Unix time, nanoseconds."""
@@ -102,6 +105,20 @@ LEVELS: Final = {"info": 2, "good": 2, "bad": 3}
 """Level of an event → level of foxglove.Log: information or warning."""
 
 
+def _end_without_index() -> bytes:
+    stream = io.BytesIO()
+    writer = Writer(
+        stream, index_types=IndexType.NONE, repeat_channels=False, repeat_schemas=False,
+        use_statistics=False, use_summary_offsets=False,
+    )  # fmt: skip
+    writer.finish()  # type: ignore[no-untyped-call]
+    return stream.getvalue()
+
+
+_END_WITHOUT_INDEX: Final = _end_without_index()
+"""What ends a file as long as its index is not written, so that it can be read however the run ends."""
+
+
 class McapRecorder:
     """Records a run. Log times are simulation time since `run.start_unix_s`, whatever the device's clock shows."""
 
@@ -119,10 +136,13 @@ class McapRecorder:
         self.dropped = 0
         """Writes that were dropped because the disk was too slow."""
         self._task: asyncio.Task[None] | None = None
-        self.file = OutputFile("recording", path, overwrite=overwrite)
-        self._stream = io.BufferedWriter(self.file.stream)
-        self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
+        self._stream = _Records()
+        stream: Any = self._stream
+        self._writer = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library="starhil")
+        self.file = OutputFile(
+            "recording", path, header=self._stream.take(), tail=_END_WITHOUT_INDEX, overwrite=overwrite
+        )
         telemetry = {
             f"starhil.Telemetry.{row.name}": _telemetry_schema(row) for row in head.icd.telemetry.values()
         }
@@ -158,8 +178,7 @@ class McapRecorder:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
         await asyncio.to_thread(self._disk.shutdown, wait=True)
-        self._on_disk(self._writer.finish)
-        self._on_disk(self._stream.flush)
+        self.file.append_last(lambda: self._records_of(self._writer.finish))
         self.file.close()
         if self.dropped:
             log.warning(
@@ -286,9 +305,34 @@ class McapRecorder:
 
     def _on_disk(self, action: Callable[[], object]) -> None:
         """Write to the file, unless writing has failed."""
-        if not self.file.output.failed:
-            with self.file.output.guarded():
-                action()
+        self.file.append(lambda: self._records_of(action))
+
+    def _records_of(self, action: Callable[[], object]) -> bytes:
+        action()
+        return self._stream.take()
+
+
+class _Records(io.BufferedIOBase):
+    """Where a writer of MCAP writes: the records since the last `take`, at the position that they will have in the file."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._position = 0
+
+    def write(self, data: Any) -> int:
+        """Take bytes."""
+        self._parts.append(bytes(data))
+        self._position += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        """Return the position in the file."""
+        return self._position
+
+    def take(self) -> bytes:
+        """Return what was written since the last call."""
+        parts, self._parts = self._parts, []
+        return b"".join(parts)
 
 
 def _register(writer: Writer, schemas: dict[str, dict[str, Any]]) -> dict[str, int]:

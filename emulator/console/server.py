@@ -50,6 +50,9 @@ DOCS: Final = Path(__file__).resolve().parents[2] / "docs"
 LARGEST_MESSAGE: Final = 1 << 16
 """Longest message that a page may send, bytes."""
 
+MAX_HEADERS: Final = 64
+"""Maximum number of headers of a request; browsers send some twenty."""
+
 LARGEST_REPORT: Final = 1 << 20
 """Longest report that is accepted, bytes."""
 
@@ -143,6 +146,7 @@ class ConsoleServer:
             shutdown_timeout=0.5,
             keepalive_timeout=REQUEST_S,
             lingering_time=LINGER_S,
+            max_headers=MAX_HEADERS,
         )
         await self._runner.setup()
         server, limit = cast("web.Server", self._runner.server), ConnectionLimit("console", BUSY)

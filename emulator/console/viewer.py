@@ -30,6 +30,9 @@ WAIT_ABOVE: Final = 20
 BEAT_S: Final = 0.25
 """Longest time between two turns to a page that acknowledges them, seconds: by it a page knows how old what it shows is."""
 
+PAUSE_S: Final = 0.1
+"""Shortest time between two turns to a page that lacks nothing of the past, seconds: each makes the page draw."""
+
 TURN_TEXT: Final = 32 * 1024
 """Length of queued messages above which the rest waits for the next turn, characters."""
 
@@ -190,12 +193,13 @@ class Viewer:
             The page has closed.
         """
         while True:
-            await self._free.wait()
-            if not (self._lacking_rows.gaps or self._lacking_events.gaps):
-                with contextlib.suppress(TimeoutError):
-                    async with asyncio.timeout(BEAT_S):
-                        await self._wake.wait()
             await self.flush()
+            if not (self._lacking_rows.gaps or self._lacking_events.gaps):
+                await asyncio.sleep(PAUSE_S)
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(BEAT_S - PAUSE_S):
+                        await self._wake.wait()
+            await self._free.wait()
 
     async def flush(self) -> None:
         """Send a turn, unless the page has not acknowledged the last one.

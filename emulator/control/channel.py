@@ -39,6 +39,7 @@ from starhil.emulator.run.tape import AwaitedPhase, ClearedFaults, NewFaults
 from starhil.emulator.run.truth_log import compare
 from starhil.emulator.sensor.pipeline.messages import as_quaternion
 from starhil.emulator.simulation.guard import until_cancelled
+from starhil.emulator.simulation.scheduler import Action as SchedulerAction
 from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.json_lines import JsonError, parse_object, read_lines
@@ -76,6 +77,7 @@ LATE_ANSWER: Final = (
 Answer = dict[str, Any]
 Action = Callable[[Head, dict[str, Any]], Awaitable[Answer]]
 Model = TypeVar("Model", bound=BaseModel)
+Result = TypeVar("Result")
 
 
 class ControlServer:
@@ -87,7 +89,8 @@ class ControlServer:
         """Latest measurements by number of the head."""
         self._token = token
         self._socket: ControlSocket | None = None
-        self._opening = asyncio.Lock()
+        self._opening: asyncio.Task[Any] | None = None
+        """The last request for which files are read."""
         self._quit = quit_run
         self._server: asyncio.Server | None = None
         self._peers: dict[asyncio.StreamWriter, bool] = {}
@@ -278,8 +281,7 @@ class ControlServer:
             if not isinstance(request["truth"], dict):
                 raise EmulatorError("truth: must be an object with the keys of [truth] in a profile")
             config = (await _parse(_Truth, request)).truth
-        async with self._opening:  # reading a file takes time, so the last request wins
-            await self._run.truth.set(config)
+        await self._read_files(lambda: self._run.truth.set(config))
         return {"kind": config.kind, "address": self._run.truth.address}
 
     async def _step(self, _head: Head, request: dict[str, Any]) -> Answer:
@@ -311,6 +313,7 @@ class ControlServer:
             raise EmulatorError(
                 f"phase: must be one of {', '.join(phases)}{did_you_mean(str(phase), phases)}"
             )
+        head.device.cycle.check_awaits()
         reached = asyncio.Event()
         self._run.wiring.enter(AwaitedPhase, phase=phase)
         head.device.cycle.at_phase(phase, lambda _due_ns: reached.set())
@@ -339,11 +342,36 @@ class ControlServer:
         if self._run.wiring.records:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         name, start_s = str(request.get("name", "")), self._run.clock.now_ns() / NANOSECONDS
-        async with self._opening:
-            scenario = await in_thread(lambda: load_scenario(name))
-            events = await in_thread(lambda: scenario.prepare(head, self._run.truth, start_s))
+
+        async def read() -> list[tuple[int, SchedulerAction]]:
+            scenario = await in_thread(load_scenario, name)
+            return await in_thread(scenario.prepare, head, self._run.truth, start_s)
+
+        events = await self._read_files(read)
         head.device.scheduler.add(events)
         return {"events": len(events)}
+
+    async def _read_files(self, read: Callable[[], Awaitable[Result]]) -> Result:
+        """Return what a request reads, for which an earlier one is given up: its file may be long, or never be read."""
+        earlier = self._opening
+        if earlier is not None:
+            earlier.cancel()
+
+        async def after_earlier() -> Result:
+            if earlier is not None:
+                await asyncio.wait([earlier])
+            return await read()
+
+        self._opening = task = asyncio.create_task(after_earlier())
+        try:
+            await asyncio.wait([task])
+        finally:
+            task.cancel()
+            if self._opening is task:
+                self._opening = None
+        if task.cancelled():
+            raise EmulatorError("a later set_truth or scenario has taken its place; the file was not read")
+        return task.result()
 
     async def _quit_run(self, _head: Head, _request: dict[str, Any]) -> Answer:
         asyncio.get_running_loop().call_soon(self._quit)

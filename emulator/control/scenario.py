@@ -75,7 +75,10 @@ class ScenarioEvent(Strict):
             if self.clear_faults:
                 faults.clear()
             if self.fault is not None:
-                faults.inject(self.fault)
+                try:
+                    faults.inject(self.fault)
+                except EmulatorError as error:
+                    log.warning("scenario at %g s: %s", at_s, error)
             if config is not None and source is not None and truth is not None:
                 truth.put(source, config)
             log.info("scenario at %g s", at_s)

@@ -61,10 +61,9 @@ class ControlSocket:
 def automatic_path() -> Path:
     """Return the default socket path of this process, in a folder private to its user; remove those of killed emulators."""
     base = Path(os.environ.get("XDG_RUNTIME_DIR") or "/nonexistent")
-    if _is_own_folder(base):
-        folder = base / "starhil"
-    else:
-        folder = Path(tempfile.gettempdir()) / f"starhil-{os.geteuid()}"
+    folder = (
+        base / "starhil" if _is_own_folder(base) else Path(tempfile.gettempdir()) / f"starhil-{os.geteuid()}"
+    )
     with explained(f"control channel: {folder} cannot be used", "give --control unix:/PATH"):
         folder.mkdir(mode=PRIVATE_FOLDER, exist_ok=True)
         if not _is_own_folder(folder):

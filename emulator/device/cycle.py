@@ -28,6 +28,7 @@ from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming
 from starhil.emulator.device.signals import Signals
 from starhil.emulator.device.surroundings import Surroundings
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
 from starhil.emulator.sensor.pipeline.client import PipelineClient, PipelineReply
 from starhil.emulator.sensor.pipeline.messages import (
@@ -56,6 +57,9 @@ Argument = TypeVar("Argument")
 
 MAX_PENDING: Final = 2
 """Number of pending requests at which exposures are skipped; more if more fit into the modelled time."""
+
+MAX_AWAITED: Final = 256
+"""Largest number of actions that await a phase of the next exposure, of which there may be none for any time."""
 
 LONGEST_GAP_PERIODS: Final = 2.5
 """Longest gap between two attitudes from which a rate is estimated, update periods."""
@@ -126,6 +130,8 @@ class FrameCycle:
         """Bits flipped in the star catalogue since start-up."""
         self._stored_upsets: tuple[CatalogUpset, ...] = ()
         """Those flipped where the catalogue is stored, which a restart does not undo."""
+        self.pipeline_starts = 0
+        """How often the pipeline has been started."""
         self.index = 0
         """Index of the next exposure; never reset, so that no two exposures have the same noise."""
         self.published = 0
@@ -179,8 +185,16 @@ class FrameCycle:
         self.published = self.skipped = 0
         self.upsets = self._stored_upsets
 
+    def check_awaits(self) -> None:
+        """Check that one more action can await a phase."""
+        if len(self._awaiting) >= MAX_AWAITED:
+            raise EmulatorError(
+                f"phase: {MAX_AWAITED} requests await the next exposure already, and none has begun (mode {self._modes.mode.value})"
+            )
+
     def at_phase(self, phase: Phase, action: Action) -> None:
-        """Do something once, at a phase of the next exposure that begins."""
+        """Do something once, at a phase of the next exposure that begins; EmulatorError if too much awaits one."""
+        self.check_awaits()
         self._awaiting.append((phase, action))
 
     def retime(self) -> None:
@@ -254,7 +268,7 @@ class FrameCycle:
         truth = self._surroundings.state(mid_ns)
         predicted = self._predict(mid_ns) if mode is Mode.TRACKING else None
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
-        request = self._request(truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
+        request = self._request(start_ns, truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
         if predicted is not None and self._parameters["prediction_enable"]:
             error = self._history.covariance(mid_ns)
             request = replace(request, prediction_covariance=error, predicted_rate_rad_s=self._history.rate())
@@ -303,10 +317,13 @@ class FrameCycle:
 
     def single_frame(self, mid_ns: int) -> FrameRequest:
         """Return the request for an exposure that is not solved, with a given simulation time of mid-exposure."""
-        return self._request(self._surroundings.state(mid_ns), self.exposure_s, None, None, solve=False)
+        exposure_s = self.exposure_s
+        start_ns = mid_ns - round(exposure_s * NANOSECONDS / 2)
+        return self._request(start_ns, self._surroundings.state(mid_ns), exposure_s, None, None, solve=False)
 
     def _request(
         self,
+        start_ns: int,
         truth: TruthState,
         exposure_s: float,
         predicted: Attitude | None,
@@ -332,6 +349,8 @@ class FrameCycle:
             particles_s=conditions.particles_s,
             upsets=self.upsets,
             observer_velocity=velocity,
+            begin_s=start_ns / NANOSECONDS,
+            pipeline_starts=self.pipeline_starts,
         )
 
     def _predict(self, mid_ns: int) -> Attitude | None:

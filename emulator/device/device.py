@@ -207,6 +207,7 @@ class Device:
     def pipeline_ready(self, camera_constants: dict[str, Value]) -> None:
         """Handle a ready pipeline; its camera constants become defaults."""
         self.warm = True
+        self.cycle.pipeline_starts += 1
         adopt_camera(self.parameters, self.profile, camera_constants)
         if self._boot_end is None and self.modes.mode is Mode.BOOT:
             self._end_boot()

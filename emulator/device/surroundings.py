@@ -64,6 +64,11 @@ class Surroundings:
         self._lacks_orbit = False
         return completed
 
+    @property
+    def has_orbit(self) -> bool:
+        """Whether the sensor is on an orbit now."""
+        return self.state(self._now_ns()).orbit is not None
+
     def conditions(self, truth: TruthState) -> Conditions:
         """Return the current conditions of the detector."""
         position_m = None if truth.orbit is None else truth.orbit.position_m

@@ -37,7 +37,15 @@ from starhil.emulator.profile.toml_file import find_toml, read_toml
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.sky.tables import SKY
 from starhil.emulator.simulation.config_model import Strict, UserPath, plain_model
-from starhil.emulator.truth.config import FixedConfig, OrbitConfig, TruthConfig, profile_paths
+from starhil.emulator.truth.config import (
+    Config42,
+    FileConfig,
+    FixedConfig,
+    LiveConfig,
+    OrbitConfig,
+    TruthConfig,
+    profile_paths,
+)
 from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError, remedy
 from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled_units, find, not_found
 from starhil.protocol.files.user_file import TomlError, parse_toml
@@ -116,6 +124,13 @@ class Profile(Strict):
     def _some_use_of_images(self) -> Self:
         if self.images.used and self.run.worker == "error_model":
             raise ValueError('images: run.worker = "error_model" uses no images; choose process or thread')
+        return self
+
+    @model_validator(mode="after")
+    def _orbit_of_satellites(self) -> Self:
+        carries_orbit = isinstance(self.truth, FileConfig | LiveConfig | Config42)
+        if self.sky.get("satellites") is not None and self.orbit is None and not carries_orbit:
+            raise ValueError("sky.satellites: they are seen from an orbit; give one, such as orbit=leo")
         return self
 
     @model_validator(mode="after")

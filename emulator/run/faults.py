@@ -239,12 +239,19 @@ class Faults:
 
     def check(self, request: FaultRequest) -> None:
         """Check that the faults of a request can be injected."""
+        if request.phase is not None:
+            self._device.cycle.check_awaits()
         if request.device is not None:
             for key, effect, value in _values(request.device):
                 if effect.enum and value not in (known := effect.names(self._device.icd)):
                     near = did_you_mean(value, known)
                     raise EmulatorError(f"device.{key}: {value!r} is not one of {', '.join(known)}{near}")
                 effect.check(self._device, value)
+        satellites = (request.optical or {}).get("satellites")
+        if satellites is not None and not self._device.surroundings.has_orbit:
+            raise EmulatorError(
+                "optical.satellites: they are seen from an orbit; start the run with one, such as --orbit leo"
+            )
         shown = {name: link.shown_in_replies for name, link in self._links.items()}
         for fault in request.telemetry or ():
             self._telemetry.check(fault, shown)

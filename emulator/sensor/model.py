@@ -69,6 +69,15 @@ class SensorModel:
     """Black level as a fraction of the range."""
     full_well_e: float = limited(10.0, 1e7, 15000.0, unit="electrons")
     """Full-well capacity, electrons."""
+    blooming: float = limited(0.0, 1.0, 0.0, unit="fraction")
+    """Fraction of the charge beyond the full well that spills along the column. 0: all is drained, as in most CMOS pixels; 1: a
+    CCD without drains."""
+    persistence_share: float = limited(0.0, 1.0, 0.0, unit="of the full well")
+    """Charge that traps keep in a pixel that has reached its full well, and release into later images. 0.004, that is 240 electrons,
+    in one front-illuminated CCD (KAF-3200)."""
+    persistence_s: float = limited(1e-3, 1e5, 1.0, unit="seconds")
+    """Time constant with which they release it, seconds: from less than one near room temperature, an assumption, to minutes in
+    cooled detectors."""
     read_noise_e: float = limited(0.0, 1e4, 12.0, unit="electrons")
     """Electrons, standard deviation."""
     dark_e_s: float = limited(0.0, 1e6, 30.0, unit="electrons/s")

@@ -12,35 +12,31 @@ import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.fixed_pattern import FixedPattern, make_fixed_pattern
-from starhil.emulator.sensor.model import SOLAR_COLOUR_B_V, SensorModel
+from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.noise import digitize
+from starhil.emulator.sensor.overexposure import Afterimage, spill
 from starhil.emulator.sensor.particle_hits import add_protons
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.rolling_shutter import at_row_times
 from starhil.emulator.sensor.sky.area_light import AreaLight, Backdrop
-from starhil.emulator.sensor.sky.catalog_errors import as_in_the_sky
 from starhil.emulator.sensor.sky.ephemeris import Observer
 from starhil.emulator.sensor.sky.light import AreaPainter
 from starhil.emulator.sensor.sky.objects import PointSource, SkyObjects
+from starhil.emulator.sensor.sky.satellites import Satellites
+from starhil.emulator.sensor.sky.stars import SkyStars
 from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask
 from starid.arithmetic.elementary import acos, cos, square
 from starid.arithmetic.matrices import length, lengths, product
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
-from starid.catalog.catalog import companions
 from starid.catalog.photometry import flux_ratio
-from starid.catalog.variable_stars import BRIGHTEST, HIP, variable_magnitudes
 
 __all__ = ["Frame", "Renderer", "SensorModel", "StarTruth", "render"]
 
 _MAX_RATE_RAD_S: Final = 20.0
 _VISIBLE_SHARE: Final = 0.5
-_COMPANION_RAD: Final = math.radians(1.0)
-"""Largest distance of a companion: with coarser pixels it would take minutes to find them all."""
-_COMPANION_PX: Final = 2.0
 _OBJECT_STREAM: Final = 2
-_CATALOG_STREAM: Final = 3
 _FLOOD_WELLS: Final = 10.0
 """Full wells of electrons in every pixel when light passes the baffle."""
 
@@ -81,6 +77,8 @@ class ObjectTruth:
     """Positions of the planets in the order of `SkyObjects.planets`, (m, 2); NaN outside the image."""
     cosmic_rays_px: Array
     """x, y of both ends of each track, (k, 4)."""
+    satellites_px: Array
+    """x, y of both ends of the trail of each satellite, (s, 4); also of those that touch the image only with their spot."""
     covered_share: float
     """Fraction of the image that receives less than half of the sky's light."""
 
@@ -134,9 +132,8 @@ def frame_without_truth(image: GreyImage, frame_index: int) -> Frame:
 class Renderer:
     """Renders exposures for one camera, catalogue and sensor, and caches what they share.
 
-    An image depends only on the arguments and on (seed, frame_index), not on earlier images. Stars fainter than the
-    sensor's limiting magnitude are omitted, except unresolved companions of brighter stars. `objects` are the default
-    of all exposures.
+    An image depends only on the arguments and on (seed, frame_index); on earlier images only by an afterimage. `objects` are the default of
+    all exposures.
     """
 
     def __init__(
@@ -153,25 +150,7 @@ class Renderer:
         self.seed = _whole_number("seed", seed)
         self.objects = objects
         self._painter = AreaPainter(camera, self.sensor.zero_magnitude_e_s, self.sensor.psf_sigma_px)
-        colour = np.nan_to_num(catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
-        brightness = np.asarray(catalog.v - self.sensor.colour_term * colour, dtype=np.float64)
-        limit = self.sensor.limiting_magnitude
-        varying = np.flatnonzero(np.isin(catalog.hip, HIP[limit >= BRIGHTEST]))
-        near = companions(catalog, limit, min(_COMPANION_PX * camera.pixel_scale_rad, _COMPANION_RAD))
-        rows = np.unique(np.concatenate([np.flatnonzero(catalog.v <= limit), near, varying]))
-        self._rows = rows[np.argsort(brightness[rows], kind="stable")]
-        self._vectors = np.ascontiguousarray(catalog.vectors[self._rows])
-        parallax_mas = np.maximum(np.nan_to_num(catalog.parallax_mas[self._rows]), 0.0)
-        self._parallax_rad = np.radians(parallax_mas / 3.6e6)
-        self._flux_e_s = self.sensor.zero_magnitude_e_s * flux_ratio(brightness[self._rows])
-        hip = catalog.hip[self._rows]
-        number = np.flatnonzero(np.isin(HIP, hip))
-        where = np.array([np.flatnonzero(hip == each)[0] for each in HIP[number]], dtype=np.int64)
-        self._varying = number, where, catalog.v[self._rows[where]].astype(np.float64)
-        """Of the variable stars: their number in `VARIABLE_STARS`, their rows, and V in the catalogue."""
-        self._only_at_maximum = where[(self._varying[2] > limit) & ~np.isin(self._rows[where], near)]
-        """Rows of variable stars that are within the limit only at their maximum."""
-        self._sky_stars: tuple[tuple[object, ...], Array, Array] = ((), self._vectors, np.ones(0))
+        self._stars = SkyStars(catalog, self.sensor, camera.pixel_scale_rad, seed)
         self._cos_cone = cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
         pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
         self._pattern = _vignetted(pattern, camera, self.sensor.vignetting)
@@ -198,12 +177,16 @@ class Renderer:
         temperature_c: float | None = None,
         objects: SkyObjects | None = None,
         observer: Observer | None = None,
+        satellites: Satellites | None = None,
+        afterimage: Afterimage | None = None,
+        begin_s: float = 0.0,
     ) -> Frame:
         """Render one exposure at the attitude of its middle and a constant body rate (3,), sensor frame, rad/s.
 
         The number of the frame determines the noise, together with the seed. Exposure, seconds, temperature of
         detector and lens, °C, and sky objects are by default those of the sensor and the renderer. The place and
-        motion of an observer give the stars parallax and aberration.
+        motion of an observer give the stars parallax and aberration. An afterimage adds the charge that earlier exposures left
+        in traps, and keeps what this one leaves, which begins at `begin_s`.
         """
         given = {"exposure_s": exposure_s, "temperature_c": temperature_c}
         sensor = self.sensor.with_(**{name: value for name, value in given.items() if value is not None})
@@ -220,12 +203,12 @@ class Renderer:
         mean = self._mean_without_stars(exposure, temperature, area)
         self._pattern.telegraph.add(mean, index, exposure * sensor.dark_factor(temperature))
         planets = () if others is None else others.planets
-        vectors, flux_e_s = self._as_in_the_sky(others, observer)
+        vectors, flux_e_s = self._stars.shown(others, observer)
         path, sources, inside = self._paths(
             vectors, flux_e_s > 0.0, optical_axis, rate, exposure, observer, planets
         )
-        count = int(np.count_nonzero(sources < len(self._rows)))
-        magnitudes = [planets[number - len(self._rows)].magnitude for number in sources[count:]]
+        count = int(np.count_nonzero(sources < len(self._stars)))
+        magnitudes = [planets[number - len(self._stars)].magnitude for number in sources[count:]]
         planets_e = [self.sensor.electrons(magnitude, exposure) for magnitude in magnitudes]
         electrons = np.concatenate([flux_e_s[sources[:count]] * exposure, planets_e])
         drawn, lit, centred = electrons, path, np.flatnonzero(inside[:count])
@@ -237,18 +220,24 @@ class Renderer:
                 drawn *= area.seen_at(path[:, :2])
             planet_xy = np.full((len(planets), 2), np.nan)
             shown = count + np.flatnonzero(inside[count:])
-            planet_xy[sources[shown] - len(self._rows)] = path[shown, :2]
+            planet_xy[sources[shown] - len(self._stars)] = path[shown, :2]
             rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
             false_xy = self._add_false_stars(mean, others, rng, exposure)
             lit, drawn = _disturbed(path, drawn, others, rng)
             if others.ghost_share > 0.0:
                 self._add_light(mean, *_ghosts(self._optics, lit, drawn, others.ghost_share))
+            satellites_px = self._add_satellites(mean, satellites, optical_axis, rate, exposure, area)
             particles = int(rng.poisson(others.cosmic_rays_s * exposure))
             tracks = add_protons(mean, particles, rng, sensor.epi_um, sensor.pixel_um)
-            object_truth = ObjectTruth(false_xy, planet_xy, tracks, area.covered_share if area else 0.0)
+            covered = area.covered_share if area else 0.0
+            object_truth = ObjectTruth(false_xy, planet_xy, tracks, satellites_px, covered)
         self._add_light(mean, lit, drawn)
+        if sensor.blooming > 0.0:
+            spill(mean, sensor.full_well_e, sensor.blooming)
+        if afterimage is not None:
+            afterimage.expose(mean, begin_s, begin_s + exposure)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
-        rows = self._rows[sources[centred]]
+        rows = self._stars.rows[sources[centred]]
         stars = StarTruth(
             self.catalog.hip[rows],
             rows.astype(np.int64),
@@ -281,6 +270,30 @@ class Renderer:
         self._add_light(mean, path, self.sensor.electrons(0.0, exposure_s) * flux_ratio(magnitudes))
         return xy
 
+    def _add_satellites(
+        self,
+        mean: Array32,
+        satellites: Satellites | None,
+        attitude: Attitude,
+        rate: Array,
+        exposure_s: float,
+        area: AreaLight | None,
+    ) -> Array:
+        """Add the trails of satellites to the limiting magnitude; return both ends of each (n, 4), pixels."""
+        if satellites is None:
+            return np.zeros((0, 4))
+        crossing = satellites.crossing(attitude.boresight, self._cosine_of_cone(rate, exposure_s), exposure_s)
+        bright = crossing.magnitudes <= self.sensor.limiting_magnitude
+        begin, middle, end = crossing.directions[:, bright]
+        path, _, touching = self._path_of((begin, middle, end), attitude, rate, exposure_s)
+        path, magnitudes = path[touching], crossing.magnitudes[bright][touching]
+        electrons = self.sensor.electrons(0.0, exposure_s) * flux_ratio(magnitudes)
+        if area is not None:
+            electrons = electrons * area.seen_at(path[:, :2])
+        self._add_light(mean, path, electrons)
+        centre, half, bend = path[:, :2], path[:, 2:4], path[:, 4:6]
+        return np.column_stack([centre - half + bend, centre + half + bend])
+
     def trails(self, frame: Frame) -> Array:
         """Return the displacements (n, 2) of a frame's stars during its exposure, pixels."""
         icrs = self.catalog.vectors[frame.stars.catalog_index]
@@ -308,40 +321,6 @@ class Renderer:
             area.draw(self._work, backdrop)
         return self._work
 
-    def _as_in_the_sky(self, objects: SkyObjects | None, observer: Observer | None) -> tuple[Array, Array]:
-        """Return directions (n, 3) and electrons/s (n,) of the stars.
-
-        They differ from the catalogue's by its errors, and at a date by the variable stars.
-        """
-        vectors, flux_e_s = self._with_catalog_errors(objects)
-        number, rows, in_catalog = self._varying
-        if not rows.size:
-            return vectors, flux_e_s
-        flux_e_s = flux_e_s.copy()
-        if observer is None:
-            flux_e_s[self._only_at_maximum] = 0.0
-        else:
-            fainter = variable_magnitudes(observer.unix_s)[number] - in_catalog
-            flux_e_s[rows] *= flux_ratio(fainter)
-        return vectors, flux_e_s
-
-    def _with_catalog_errors(self, objects: SkyObjects | None) -> tuple[Array, Array]:
-        """Return directions (n, 3) and electrons/s (n,) of the stars, with the catalogue's errors against the sky."""
-        if objects is None:
-            return self._vectors, self._flux_e_s
-        errors = (
-            objects.catalog_position_error_arcsec,
-            objects.catalog_magnitude_error,
-            objects.catalog_errors,
-        )
-        if not any(errors):
-            return self._vectors, self._flux_e_s
-        if self._sky_stars[0] != errors:
-            rng = np.random.default_rng((self.seed, _CATALOG_STREAM))
-            vectors, fainter = as_in_the_sky(self.catalog.hip[self._rows], self._vectors, *errors, rng)
-            self._sky_stars = errors, vectors, flux_ratio(fainter)
-        return self._sky_stars[1], self._flux_e_s * self._sky_stars[2]
-
     def _paths(
         self,
         vectors: Array,
@@ -357,41 +336,46 @@ class Renderer:
         The stars are in directions `vectors` (k, 3), those that `shine`. A path is the parabola through the projections at the start,
         middle and end of the exposure. The numbers of planets follow those of the stars.
         """
-        readout_s = self.camera.height * self.sensor.row_time_s
-        sweep = length(rate) * (exposure_s + readout_s)
-        cosine = cos(min(acos(self._cos_cone) + sweep, math.pi))
+        cosine = self._cosine_of_cone(rate, exposure_s)
         near = np.flatnonzero((product(vectors, attitude.boresight) >= cosine) & shine)
-        icrs = vectors[near]
-        if observer is not None:
-            icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
+        icrs = self._stars.apparent(vectors, near, observer)
         if planets:
             vectors = np.array([planet.direction for planet in planets])
             icrs = np.concatenate([icrs, vectors])
-            near = np.concatenate([near, len(self._rows) + np.arange(len(planets))])
-        path, inside, touching = self._path_of(icrs, attitude, rate, exposure_s)
+            near = np.concatenate([near, len(self._stars) + np.arange(len(planets))])
+        path, inside, touching = self._path_of((icrs, icrs, icrs), attitude, rate, exposure_s)
         return path[touching], near[touching], inside[touching]
+
+    def _cosine_of_cone(self, rate: Array, exposure_s: float) -> float:
+        """Return the cosine of the angle from the boresight within which stars can reach the image during an exposure."""
+        readout_s = self.camera.height * self.sensor.row_time_s
+        sweep = length(rate) * (exposure_s + readout_s)
+        return cos(min(acos(self._cos_cone) + sweep, math.pi))
 
     def _path_of(
         self,
-        icrs: Array,
+        icrs: tuple[Array, Array, Array],
         attitude: Attitude,
         rate: Array,
         exposure_s: float,
     ) -> tuple[Array, Mask, Mask]:
-        """Return paths (n, 6) of directions (n, 3), and masks of those centred inside and touching the image."""
+        """Return paths (n, 6), and masks of those centred inside and touching the image.
+
+        They are those of directions (n, 3) at begin, middle and end of the exposure.
+        """
         camera, row_time_s = self._optics, self.sensor.row_time_s
 
-        def positions(turn: Array) -> tuple[Array, Mask]:
+        def positions(icrs: Array, turn: Array) -> tuple[Array, Mask]:
             seen = (attitude.rotated(turn) if np.any(turn) else attitude).to_sensor(icrs)
             return camera.project(at_row_times(seen, camera, rate, row_time_s))
 
         half = 0.5 * exposure_s * rate
-        middle, inside = positions(np.zeros(3))
-        path = np.zeros((len(icrs), 6))
+        middle, inside = positions(icrs[1], np.zeros(3))
+        path = np.zeros((len(middle), 6))
         path[:, :2] = middle
-        if np.any(rate):
-            start, _ = positions(-half)
-            end, _ = positions(half)
+        if np.any(rate) or icrs[0] is not icrs[2]:
+            start, _ = positions(icrs[0], -half)
+            end, _ = positions(icrs[2], half)
             path[:, 2:4] = 0.5 * (end - start)
             path[:, 4:6] = 0.5 * (end + start) - middle
         reach = 1.0 + MAX_RADIUS_SIGMA * self.sensor.psf_sigma_px * (1.0 + 2.0 * self.sensor.psf_growth)

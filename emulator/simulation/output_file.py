@@ -46,7 +46,7 @@ class OutputFile:
     """A file of complete, unbuffered records; only one emulator at a time can write to it. If it is rejected, it is unchanged.
 
     The name says what it is, for messages: `truth log`. It may be part of a larger output, of which nothing is
-    written after a failure.
+    written after a failure. The file ends with `tail` after each record, so that it is complete however the run ends.
     """
 
     def __init__(
@@ -55,6 +55,7 @@ class OutputFile:
         path: Path,
         *,
         header: bytes = b"",
+        tail: bytes = b"",
         overwrite: bool = False,
         output: Output | None = None,
     ) -> None:
@@ -62,9 +63,12 @@ class OutputFile:
         self._name = f"{name} {path}"
         self.output = Output(self._name) if output is None else output
         self._size = 0
+        """Size without the tail, bytes."""
+        self._tail = b""
         file: io.FileIO | None = None
         try:
             self.stream = file = self._open(overwrite=overwrite)
+            self._tail = tail
             self._append(header)
         except OSError as error:
             if file is not None:
@@ -77,21 +81,36 @@ class OutputFile:
         """Write the record that a function returns completely or not at all, unless the output has failed."""
         if not self.output.failed:
             with self.output.guarded():
-                self._append(record())
+                if data := record():
+                    self._append(data)
 
-    def _append(self, record: bytes) -> None:
-        rest = memoryview(record)
+    def append_last(self, record: Callable[[], bytes]) -> None:
+        """Write the record that ends the file in place of the tail, as `append` does."""
+        if not self.output.failed:
+            with self.output.guarded():
+                self._append(record(), last=True)
+
+    def _append(self, record: bytes, *, last: bool = False) -> None:
+        regular = stat.S_ISREG(os.fstat(self.stream.fileno()).st_mode)
         try:
-            while rest:
-                written: int | None = self.stream.write(rest)
-                if written is None:  # a character device that would block
-                    raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
-                rest = rest[written:]
+            self._write(record if last else record + self._tail, regular=regular)
         except OSError:
-            if stat.S_ISREG(os.fstat(self.stream.fileno()).st_mode):
-                self.stream.truncate(self._size)
+            if regular:  # the room of the tail is its own
+                self._write(self._tail, regular=True)
+                self.stream.truncate(self._size + len(self._tail))
             raise
         self._size += len(record)
+
+    def _write(self, data: bytes, *, regular: bool) -> None:
+        """Write data where the tail begins."""
+        if regular:
+            self.stream.seek(self._size)
+        rest = memoryview(data)
+        while rest:
+            written: int | None = self.stream.write(rest)
+            if written is None:  # a character device that would block
+                raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
+            rest = rest[written:]
 
     def close(self) -> None:
         """Close the file."""

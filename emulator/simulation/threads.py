@@ -7,7 +7,6 @@ import sys
 import threading
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Executor, Future
-from functools import partial
 from typing import Any, Final, ParamSpec, TypeVar, TypeVarTuple
 
 Arguments = ParamSpec("Arguments")
@@ -44,14 +43,35 @@ class _AbandonedThreads(Executor):
 
 _THREADS: Final = _AbandonedThreads()
 
+_CALL: Final = threading.local()
+"""Of a thread of `in_thread`: `over`, an event that is set when nobody waits for its call any more."""
+
 
 async def in_thread(
     function: Callable[Arguments, Result], *args: Arguments.args, **kwargs: Arguments.kwargs
 ) -> Result:
-    """Call a function without effects, which is abandoned if the run ends first."""
-    call: Any = partial(function, *args, **kwargs)
-    result: Result = await asyncio.get_running_loop().run_in_executor(_THREADS, call)
-    return result
+    """Call a function without effects, which is abandoned if the run ends or the caller is cancelled first."""
+    over = threading.Event()
+
+    def call() -> Result:
+        _CALL.over = over
+        return function(*args, **kwargs)
+
+    try:
+        return await asyncio.get_running_loop().run_in_executor(_THREADS, call)
+    finally:
+        over.set()
+
+
+def is_abandoned() -> bool:
+    """Return whether this thread runs a call of `in_thread` for which nobody waits any more."""
+    over: threading.Event | None = getattr(_CALL, "over", None)
+    return over is not None and over.is_set()
+
+
+def call_within(limit_s: float, function: Callable[[], Result]) -> Result:
+    """Call a function that may never return, as on a network folder without a server; TimeoutError if it takes too long."""
+    return _THREADS.submit(function).result(limit_s)
 
 
 class _Loop(asyncio.SelectorEventLoop):

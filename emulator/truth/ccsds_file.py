@@ -50,6 +50,9 @@ log = logging.getLogger("starhil.truth")
 TYPES: Final = {"QUATERNION": 4, "EULER_ANGLE": 3, "QUATERNION/ANGVEL": 7, "EULER_ANGLE/ANGVEL": 6}
 """Attitude types that are read, and the numbers in a row of each."""
 
+MAX_NUMBER: Final = 1e6
+"""Largest number in a row of attitudes; angles may exceed a turn."""
+
 XML_ORDER: Final = {"EPOCH": 0, "Q1": 1, "Q2": 2, "Q3": 3, "QC": 4}
 """Elements that come first in a row, whatever their order in the file."""
 
@@ -181,6 +184,8 @@ def _attitudes(where: str, segment: Segment) -> list[Row]:
     for size in {len(numbers) for _, numbers in segment.rows} - {TYPES[kind]}:
         raise EmulatorError(f"{where}: {size} numbers in a row of {kind}, which has {TYPES[kind]}")
     values, rates = np.array([numbers for _, numbers in segment.rows]), None
+    if np.abs(values).max() > MAX_NUMBER:
+        raise EmulatorError(f"{where}: a number is outside ±{MAX_NUMBER:g}")
     if kind.startswith("QUATERNION"):
         scalar_first = _choice(where, segment, "QUATERNION_TYPE", "LAST", "FIRST")
         quaternions, values = np.roll(values[:, :4], -1 if scalar_first else 0, axis=1), values[:, 4:]

@@ -458,7 +458,10 @@ class TleConfig(Strict):
     def build(self, start_unix_s: float, folder: Path) -> Orbit:  # noqa: ARG002 (one signature for all)
         """Make the orbit, which must be valid at the start of the run."""
         orbit = TleOrbit(self.line1, self.line2)
-        orbit.state(start_unix_s)
+        if doubt_of_orbit(orbit.state(start_unix_s)):
+            raise EmulatorError(
+                "orbit: TLE: is no orbit about the Earth at the run's date; give a current TLE"
+            )
         return orbit
 
 

@@ -135,7 +135,9 @@ class LiveFeed:
                     host,
                     port,
                     backlog=self._limit.size,
+                    start_serving=False,  # asyncio would lose a server whose start is cancelled
                 )
+                await self._server.start_serving()
                 address = self._server.sockets[0].getsockname()
         return f"{protocol}:{address[0]}:{address[1]}"
 

@@ -17,6 +17,7 @@ from starid.arithmetic.arrays import Array, on_grid
 from starid.arithmetic.elementary import acos, atan2, cos, hypot, sin, square
 from starid.arithmetic.matrices import dot, length, product
 from starid.catalog.earth import DAY_S, UNIX_EPOCH_JD, VELOCITY_GRID_M_S, terrestrial_time
+from starid.storage.files import read_number
 
 Vector: TypeAlias = Array
 
@@ -26,6 +27,17 @@ EARTH_J2: Final = 1.082_626_68e-3
 
 LARGEST_ECCENTRICITY: Final = 0.995
 TLE_LENGTH: Final = 69
+TLE_FIELDS: Final = {
+    "day of the epoch": (0, slice(20, 32), "", 1.0, 367.0),
+    "inclination": (1, slice(8, 16), "", 0.0, 180.0),
+    "right ascension of the node": (1, slice(17, 25), "", 0.0, 360.0),
+    "eccentricity": (1, slice(26, 33), "0.", 0.0, 1.0),
+    "argument of perigee": (1, slice(34, 42), "", 0.0, 360.0),
+    "mean anomaly": (1, slice(43, 51), "", 0.0, 360.0),
+    "mean motion": (1, slice(52, 63), "", 0.01, 20.0),
+}
+"""Numbers of a TLE that the checksum does not judge: line, columns, what precedes the number, and its range."""
+
 _KEPLER_STEPS: Final = 60
 _POSITION_GRID_M: Final = 2.0**-10
 
@@ -145,6 +157,16 @@ class TleOrbit:
                 raise EmulatorError(
                     f"orbit: line {number} of the TLE is invalid; it must begin with {number} and have {TLE_LENGTH} characters"
                 )
+        for name, (row, columns, point, low, high) in TLE_FIELDS.items():
+            text = (line1, line2)[row][columns]
+            try:
+                valid = low <= read_number(point + text.strip()) <= high
+            except ValueError:
+                valid = False
+            if not valid:
+                raise EmulatorError(
+                    f"orbit: TLE: {name} must be a number from {low:g} to {high:g}, not {text!r}; copy both lines again"
+                )
         try:
             verify_checksum(line1, line2)
             self._satellite: Any = Satrec.twoline2rv(line1, line2)
@@ -153,6 +175,9 @@ class TleOrbit:
             raise EmulatorError(f"orbit: TLE: {why}; copy both lines again") from None
         if self._satellite.error:
             raise EmulatorError(f"orbit: TLE: {_sgp4_error(self._satellite.error)}; give a current TLE")
+        motion_rad_s = 2.0 * math.pi * float(line2[TLE_FIELDS["mean motion"][1]]) / DAY_S
+        self._cubed_axis_m3 = EARTH_GM_M3_S2 / square(motion_rad_s)
+        """Cube of the semi-major axis, twice which no ellipse reaches: SGP4 diverges for a false drag term."""
 
     def state(self, unix_s: float) -> OrbitState:
         """Return position and velocity at a Unix time."""
@@ -169,6 +194,10 @@ class TleOrbit:
         c, s = cos(equinoxes), sin(equinoxes)
         to_gcrs = product(erfa.pnm00b(*tt).T, np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
         position, velocity = (product(to_gcrs, 1e3 * np.array(each)) for each in (position_km, velocity_km_s))
+        distance_m = length(position)
+        within = distance_m * distance_m * distance_m < 10.0 * self._cubed_axis_m3
+        if not (within and length(velocity) < math.inf):
+            raise EmulatorError("orbit: TLE: has no position at the run's date; give a current TLE")
         return OrbitState(on_grid(position, _POSITION_GRID_M), on_grid(velocity, VELOCITY_GRID_M_S))
 
 

@@ -127,7 +127,11 @@ class Truth:
         if config.port != 0 and _address(config) in (self.address, self._wanted_address):
             self.close()  # the same port: it must be free first
             await asyncio.sleep(0)  # the loop closes it in its next turn
-        return source, config, feed, await feed.start(config.socket, config.host, config.port)
+        try:
+            return source, config, feed, await feed.start(config.socket, config.host, config.port)
+        except BaseException:  # as by a later truth
+            feed.close()
+            raise
 
     def _is_lockstep(self, config: FeedConfig) -> bool:
         """Return whether the messages of a feed advance the clock."""

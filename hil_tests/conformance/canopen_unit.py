@@ -169,11 +169,9 @@ def _reports(entry: Entry, *quantities: str) -> bool:
 def _reported(entry: Entry, command: Row, probe: CanopenProbe) -> None:
     """Write all values of an enumeration, or else both limits; restore the previous value."""
     (name, field), *_ = command.named.items()
-    values: list[Value]
-    if is_text(command):
-        values = ["s", "star"]
-    else:
-        values = list(field.limits) if field.enum is None else list(field.enum)
+    values: list[Value] = (
+        ["s", "star"] if is_text(command) else list(field.limits if field.enum is None else field.enum)
+    )
     before = probe.value(entry)
     for value in values:
         data = written(entry, command, command.encode({name: value}))

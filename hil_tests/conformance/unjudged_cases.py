@@ -21,8 +21,8 @@ from starhil.hil_tests.judge.rows import Field, Row
 
 CLAUSE: Final = "[[telemetry]]: `value` of a field"
 PLUGIN: Final = "plugin"
-LISTED_FIELDS: Final = 20
-"""Number of fields that a reason names."""
+NAMED_FIELDS: Final = 3
+"""Number of fields that a reason names; reports have all."""
 
 
 def unjudged_cases(unit: Unit, fields: Iterable[tuple[Row, Field]]) -> Iterator[Case[Any]]:
@@ -53,13 +53,14 @@ def _kind(unit: Unit, item: Field) -> str:
     return item.quantity.partition(".")[0].partition("[")[0]
 
 
-def _listed(kind: str, fields: list[str], _probe: Probe) -> None:
-    more = len(fields) - LISTED_FIELDS
-    names = ", ".join(fields[:LISTED_FIELDS]) + (f" and {more} more" if more > 0 else "")
-    remedy = "a case in a file *_cases.py beside the definition can" + (
+def _listed(kind: str, fields: list[str], probe: Probe) -> None:
+    probe.log += [f"not judged: {name}" for name in fields]
+    names = ", ".join(fields[:NAMED_FIELDS])
+    found = names if len(fields) <= NAMED_FIELDS else f"{len(fields)} fields, such as {names}"
+    remedy = "a file *_cases.py beside the definition can judge them" + (
         "; an attitude is judged in quantities attitude.…" if kind == PLUGIN else ""
     )
-    raise CaseSkipped(f"no derived case judges {names}; {remedy}")
+    raise CaseSkipped(f"{found}; {remedy}")
 
 
 def _judged(unit: Unit, row: Row) -> Iterator[Field]:

@@ -258,7 +258,8 @@ def _fields(row: Any, icd: InterfaceDefinition) -> Iterator[Field]:
             yield Field(
                 item.name, item.kind, slot.type, slot.order, offset, size, shift, item.width, item.scale, item.bias,
                 bound.minimum if item.minimum is None else item.minimum,
-                bound.maximum if item.maximum is None else item.maximum, None if item.enum is None else item.enum.values, default, item.const,
+                bound.maximum if item.maximum is None else item.maximum,
+                None if item.enum is None else item.enum.values, default, item.const,
                 item.value, item.argument, item.telecommand, item.unit, frozenset(item.aliases.values()),
                 item.parameter or (value.removeprefix(PARAMETER) if (value := item.value or "").startswith(PARAMETER) else None),
                 item.wrap,

@@ -25,6 +25,10 @@ QUEUE_LIMIT: Final = 10_000
 RETRY_S: Final = 0.001
 """Time until the next attempt if the transmit buffer of the bus is full."""
 
+STALLED_S: Final = 0.5
+"""Time for which the bus takes no frame, seconds, after which those that wait are dropped: no other node acknowledges, or the
+controller is bus-off, and whoever comes back would take them for present ones."""
+
 READ_TIMEOUT_S: Final = 0.2
 """Timeout of one read in the reader thread (for buses without a file descriptor)."""
 
@@ -70,6 +74,8 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         self._queue: deque[CanFrame] = deque()
         self._bus_off_s = -math.inf
         """Time at which the bus was last off, on the monotonic clock, seconds."""
+        self._full_since_s: float | None = None
+        """Time since which the transmit buffer is full, on the monotonic clock, seconds; None if it is not."""
         self._timer: asyncio.Handle | None = None
         self._idle = asyncio.Event()
         self._idle.set()
@@ -213,8 +219,12 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
                 if not _is_full(error):
                     self._lost(str(error))
                     return
-                self._timer = loop.call_later(RETRY_S, self._send_queued)
-                return
+                if not self._is_stalled():
+                    self._timer = loop.call_later(RETRY_S, self._send_queued)
+                    return
+                self._drop_queue()
+                break
+            self._full_since_s = None
             self._queue.popleft()
             self.statistics.sent += 1
             if self._echoes is not None:
@@ -224,12 +234,23 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         else:
             self._idle.set()
 
+    def _is_stalled(self) -> bool:
+        """Return whether the transmit buffer, which is full, has been so for a long time."""
+        now_s = time.monotonic()
+        if self._full_since_s is None:
+            self._full_since_s = now_s
+        return now_s - self._full_since_s > STALLED_S
+
+    def _drop_queue(self) -> None:
+        self.statistics.dropped += len(self._queue)
+        self._queue.clear()
+        self._full_since_s = None
+
     def _disconnect(self) -> None:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self.statistics.dropped += len(self._queue)
-        self._queue.clear()
+        self._drop_queue()
         self._idle.set()
         if self._fd >= 0:
             asyncio.get_running_loop().remove_reader(self._fd)

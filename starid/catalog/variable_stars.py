@@ -1,12 +1,14 @@
 """Bright stars whose light varies with a period: their magnitude at a date.
 
 The elements are those of the General Catalogue of Variable Stars, version 5.1 (Samus et al. 2017, Astronomy Reports 61, 80), for
-β Lyrae, whose period grows by 19 s a year, those of Rucinski et al. 2019 (arXiv:1906.04831). Others to V 4.5 whose light
-repeats are missing: κ Pavonis, β Doradus, χ Cygni, ε Aurigae; semiregular and irregular ones, such as Betelgeuse, have no phase.
+β Lyrae, whose period grows by 19 s a year, those of Rucinski et al. 2019 (arXiv:1906.04831). These are the stars to V 4.5 whose
+light repeats and varies by more than half a magnitude; semiregular and irregular ones, such as Betelgeuse, have no phase.
 
 A pulsating star is brightest at its epoch, falls as half a wave of a cosine, and rises likewise. An eclipsing one is faintest at
 its epoch and half a period later, in dips of the shape of a cosine; those of β Lyrae leave no time between them. Light time
-to the Sun (8 min) is neglected, and Mira's maxima differ from the mean ones by weeks and by magnitudes.
+to the Sun (8 min) is neglected. Maxima of Mira and χ Cygni differ from the mean ones by weeks and by magnitudes, the
+eclipse of ε Aurigae has a flat bottom, and of κ Pavonis and β Doradus, whose elements are old and whose periods change, the
+phase may be wrong by a tenth.
 """
 
 from __future__ import annotations
@@ -47,6 +49,10 @@ VARIABLE_STARS: Final = (
     VariableStar("eta Aquilae", 97804, 3.48, 4.33, math.nan, 2_450_323.31, 7.176915, 0.32),
     VariableStar("zeta Geminorum", 34088, 3.62, 4.18, math.nan, 2_443_805.927, 10.15073, 0.50),
     VariableStar("l Carinae", 47854, 3.28, 4.18, math.nan, 2_440_736.9, 35.53584, 0.26),
+    VariableStar("beta Doradus", 26069, 3.46, 4.08, math.nan, 2_440_905.30, 9.8426, 0.48),
+    VariableStar("kappa Pavonis", 93015, 3.91, 4.78, math.nan, 2_440_140.167, 9.09423, 0.44),
+    VariableStar("epsilon Aurigae", 23416, 2.92, 3.88, 2.92, 2_445_513.0, 9884.0, 0.08),
+    VariableStar("chi Cygni", 97629, 3.3, 14.2, math.nan, 2_442_140.0, 408.05, 0.41),
     VariableStar("Mira", 10826, 2.0, 10.1, math.nan, 2_444_839.0, 331.96, 0.38),
 )
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, TypeAlias
@@ -11,7 +10,7 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask, Records
+from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices32, Mask, Records
 from starid.arithmetic.elementary import square
 from starid.errors import StaridError
 from starid.imaging.background import Background, estimate_background
@@ -52,6 +51,7 @@ from starid.imaging.spot_shape import (
 from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
 from starid.imaging.trail_flow import trail_shifts
+from starid.imaging.unmodelled_light import shift_by_edge, trail_variances
 from starid.imaging.windows import (
     DUPLICATE,
     MIN_SPREAD_PX,
@@ -81,23 +81,6 @@ _OTHER_WIDTH: Final = 0.3
 _MISFIT_SIGMA: Final = 3.0
 _RELAXED_SHARE: Final = 0.8
 _MAX_NEIGHBOURS: Final = 64
-_TRAIL_ERROR: Final = 4e-4
-"""Error along a trail, as a share of its length, that its model leaves."""
-
-_CUT_TRAIL_ERROR: Final = 0.01
-"""The same, also across, of a trail that the image's edge cuts off: its length and direction are known only from other stars."""
-
-
-_UNRESOLVED_SHARE: Final = 0.1
-"""Flux of a star on the trail of another, as a share of it, from which χ² of the fit shows it: it then stands seven sigmas out of
-the noise of the trail."""
-
-_DARK_SIGMA: Final = 6.0
-_DARK_PIXELS: Final = 3
-"""A window with this many pixels so far below the sky is cut by something dark; one or two may be dead."""
-
-_STEP_PER_SPREAD: Final = 1.349
-"""Height of a step, in standard deviations by quartiles of a ring that it divides in halves."""
 
 
 @dataclass(frozen=True)
@@ -544,49 +527,6 @@ def _misfits(fits: Records) -> tuple[Array, Mask]:
     return misfit, misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom)
 
 
-def _shift_by_edge(scene: _Scene, fits: _Fits, good: Indices, sigma_px: float) -> Array:
-    """Return how far (n,) an edge in the background may have shifted the fits of the stars `good` (n,), pixels.
-
-    An edge, as of a body in front of the sky, is not noise: all pixels on one side of it pull the same way. A step of height h
-    through the middle of a spot shifts its fit by ``h ∫ M_x θ / (F ∫ M_x²)``, with the shape M and the flux F of the star: by
-    8 π σ³ h / (√(2π) F) for a round one, and by 2 π σ² L h / F along a trail of length L. There is a step where some pixels of
-    the window are darker than any sky, or where the ring around it varies more than noise and the light of the background
-    explain.
-    """
-    background, settings, windows = scene.background, scene.settings, fits.windows[good]
-    explained = np.full(len(windows), square(background.median_noise))
-    if settings.gain_e_per_dn is not None:
-        explained += np.maximum(windows["base"] - background.median_level, 0.0) / settings.gain_e_per_dn
-    rest = square(windows["noise"]) - explained
-    step = _STEP_PER_SPREAD * np.sqrt(np.where(rest > explained, rest, 0.0))
-    ends = windows["offset"] + windows["columns"] * windows["rows"]
-    for k, (begin, end, sky2) in enumerate(zip(windows["offset"], ends, explained, strict=True)):
-        pixels = fits.pixels[begin:end]
-        darkest = -float(np.partition(pixels, _DARK_PIXELS - 1)[_DARK_PIXELS - 1])
-        if darkest > _DARK_SIGMA * math.sqrt(sky2):
-            step[k] = max(step[k], darkest)
-    trail2 = square(windows["trail_x"]) + square(windows["trail_y"])
-    reach = np.sqrt(trail2 + square(4.0 / math.sqrt(2.0 * math.pi) * sigma_px))
-    flux = fits.stars["flux"][good]
-    return np.asarray(2.0 * math.pi * square(sigma_px) * reach * step / flux, dtype=np.float64)
-
-
-def _shift_by_hidden_stars(flux: Array, length: Array, sigma_px: float, size: tuple[int, int]) -> Array:
-    """Return how far (n, 2) fainter stars on the trails of stars shift their fits along and across the trail, rms, pixels.
-
-    A trail covers an area in which a fainter star is not resolved. One of flux f, displaced by l along and x across a trail of
-    length L and flux F, shifts its fit by ``f/F · √π s · exp(−x²/4s²)`` along it if l < L, and by ``f/F · (1 − l/L) · x ·
-    exp(−x²/4s²)`` across; s is the width of the spot, with the pixel's own. The mean squares, over stars as dense as those in the
-    image, are ``2 π √(2π) L s³`` and ``⅔ √(2π) L s³`` times Σ f²/(F² A), where the sum is over the stars of area A that are
-    faint enough.
-    """
-    width2 = square(sigma_px) + 1.0 / 12.0
-    fainter = np.where(flux[None, :] < _UNRESOLVED_SHARE * flux[:, None], flux[None, :], 0.0)
-    squares = np.sum(square(fainter), axis=1) / (square(flux) * size[0] * size[1])
-    both = math.sqrt(2.0 * math.pi * width2) * width2 * np.array([2.0 * math.pi, 2.0 / 3.0])
-    return np.asarray(np.sqrt((squares * length)[:, None] * both), dtype=np.float64)
-
-
 def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detections:
     """Keep the candidates that are stars; `hot` others were rejected before."""
     background, settings = scene.background, scene.settings
@@ -603,7 +543,11 @@ def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detecti
     for variance in ("var_x", "var_y", "cov_xy", "var_flux"):
         stars[variance] *= np.where(is_bad, misfit, 1.0)
     doubt_close_pairs(stars, np.argsort(-stars["y"], kind="stable"), settings.blend_px)
-    uneven = square(_shift_by_edge(scene, fits, good, shape.sigma_px))
+    windows = fits.windows[good]
+    step = shift_by_edge(
+        windows, fits.pixels, stars["flux"], background, settings.gain_e_per_dn, shape.sigma_px
+    )
+    uneven = square(step)
     stars["var_x"] += uneven
     stars["var_y"] += uneven
     unit = 1.0 if settings.gain_e_per_dn is None else settings.gain_e_per_dn
@@ -612,15 +556,11 @@ def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detecti
         size = (scene.counts.shape[1], scene.counts.shape[0])
         shifts, trails = trail_shifts(shape.flow, middle, size, shape.sigma_px, shape.trail_px)
         middle -= shifts
-        length2 = np.sum(square(trails), axis=1)
-        cut = square(np.where(marks & AT_EDGE, _CUT_TRAIL_ERROR, 0.0)) * length2
-        hidden = square(_shift_by_hidden_stars(stars["flux"], np.sqrt(length2), shape.sigma_px, size))
-        # along and across: the same in all directions, and more along the trail
-        across = cut + hidden[:, 1]
-        more = square(_TRAIL_ERROR) + (hidden[:, 0] - hidden[:, 1]) / np.maximum(length2, 1.0)
-        stars["var_x"] += more * square(trails[:, 0]) + across
-        stars["var_y"] += more * square(trails[:, 1]) + across
-        stars["cov_xy"] += more * trails[:, 0] * trails[:, 1]
+        cut_off = (marks & AT_EDGE) != 0
+        var_x, var_y, cov_xy = trail_variances(trails, stars["flux"], cut_off, shape.sigma_px, size)
+        stars["var_x"] += var_x
+        stars["var_y"] += var_y
+        stars["cov_xy"] += cov_xy
     sigmas = np.sqrt(np.column_stack([stars["var_x"], stars["var_y"]]))
     return Detections(
         middle,

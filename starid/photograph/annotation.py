@@ -16,11 +16,13 @@ MARK_BGR: Final = (70, 190, 105)
 MISS_BGR: Final = (70, 90, 240)
 _TEXT_BGR: Final = (235, 215, 160)
 _SHADOW_BGR: Final = (20, 16, 12)
+_FRAME_BGR: Final = (110, 110, 110)
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _SUB_PIXEL_BITS: Final = 4
 _DARK: Final = 0.06
 RADIUS_PX: Final = 8.0
 """Radius of the circles, pixels."""
+_LEGEND: Final = ((MARK_BGR, "identified"), (MISS_BGR, "detected, not identified"))
 
 
 def stretch(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> npt.NDArray[np.uint8]:
@@ -64,7 +66,7 @@ def annotate(
     labels : sequence of n str
         Labels of the circles; empty for none.
     missed_xy_px : ndarray (m, 2), optional
-        Positions to mark in another colour, such as unidentified detections.
+        Detections without a star, to mark in another colour, which a legend explains if there is room.
 
     Returns
     -------
@@ -75,9 +77,15 @@ def annotate(
     height, width = image.shape
     size = max(0.32, min(width, height) / 2600.0)
     taken: list[tuple[int, int, int, int]] = []
-    for x, y in xy_px:
-        _circle(canvas, x, y, RADIUS_PX, MARK_BGR)
-        taken.append((round(x - RADIUS_PX), round(y - RADIUS_PX), round(x + RADIUS_PX), round(y + RADIUS_PX)))
+    missed = np.empty((0, 2)) if missed_xy_px is None else missed_xy_px
+    for centres, colour in ((xy_px, MARK_BGR), (missed, MISS_BGR)):
+        for x, y in centres:
+            _circle(canvas, x, y, RADIUS_PX, colour)
+            taken.append(
+                (round(x - RADIUS_PX), round(y - RADIUS_PX), round(x + RADIUS_PX), round(y + RADIUS_PX))
+            )
+    if len(missed):
+        _draw_legend(canvas, size, taken)
     for (x, y), label in zip(xy_px, labels, strict=True):
         if not label:
             continue
@@ -88,12 +96,42 @@ def annotate(
             inside = box[0] >= 0 and box[1] >= 0 and box[2] < width and box[3] < height
             if inside and (forced or not any(_overlap(box, other) for other in taken)):
                 taken.append(box)
-                cv2.putText(canvas, label, (left, base), _FONT, size, _SHADOW_BGR, 3, cv2.LINE_AA)
-                cv2.putText(canvas, label, (left, base), _FONT, size, _TEXT_BGR, 1, cv2.LINE_AA)
+                _write(canvas, label, (left, base), size)
                 break
-    for x, y in missed_xy_px if missed_xy_px is not None else ():
-        _circle(canvas, x, y, RADIUS_PX, MISS_BGR)
     return canvas
+
+
+def _write(canvas: npt.NDArray[np.uint8], text: str, at: tuple[int, int], size: float) -> None:
+    """Write a text with a dark edge; `at` is the left end of its baseline."""
+    cv2.putText(canvas, text, at, _FONT, size, _SHADOW_BGR, 3, cv2.LINE_AA)
+    cv2.putText(canvas, text, at, _FONT, size, _TEXT_BGR, 1, cv2.LINE_AA)
+
+
+def _draw_legend(canvas: npt.NDArray[np.uint8], size: float, taken: list[tuple[int, int, int, int]]) -> None:
+    """Explain the colours of the circles at the edge where that covers the fewest, as near to a corner as possible."""
+    texts = [cv2.getTextSize(text, _FONT, size, 1)[0] for _, text in _LEGEND]
+    line = round(max(2.0 * RADIUS_PX, *(height for _, height in texts)) + 6.0)
+    indent = round(2.0 * RADIUS_PX) + 12
+    width, height = indent + max(width for width, _ in texts) + 6, line * len(_LEGEND) + 4
+    right, bottom = canvas.shape[1] - width - 1, canvas.shape[0] - height - 1
+    if right < 0 or bottom < 0:
+        return
+
+    def badness(at: tuple[int, int]) -> tuple[int, int]:
+        box = (at[0], at[1], at[0] + width, at[1] + height)
+        covered = sum(_overlap(box, other) for other in taken)
+        return covered, min(at[0], right - at[0]) + min(at[1], bottom - at[1])
+
+    across, down = ([*range(0, end, 8), end] for end in (right, bottom))
+    places = [*((x, y) for x in across for y in (bottom, 0)), *((x, y) for y in down for x in (0, right))]
+    left, top = min(places, key=badness)
+    taken.append((left, top, left + width, top + height))
+    cv2.rectangle(canvas, (left, top), (left + width, top + height), _SHADOW_BGR, cv2.FILLED)
+    cv2.rectangle(canvas, (left, top), (left + width, top + height), _FRAME_BGR, 1)
+    for row, ((colour, text), (_, text_height)) in enumerate(zip(_LEGEND, texts, strict=True)):
+        middle = top + 2 + line * row + line // 2
+        _circle(canvas, left + 6 + RADIUS_PX, middle, RADIUS_PX, colour)
+        _write(canvas, text, (left + indent, middle + text_height // 2), size)
 
 
 def _circle(

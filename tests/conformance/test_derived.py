@@ -433,3 +433,15 @@ def test_parameters_that_a_row_reports_are_restored_after_the_run(tmp_path):
         outcomes = run_cases(simulated.probe, [case])
         assert [outcome.status for outcome in outcomes] == ["passed"]
         assert simulated.probe.telemetry("imaging_state") == before
+
+
+def test_a_reason_names_few_fields_and_the_reports_list_all() -> None:
+    unit = read_unit("cubestar")
+    (case,) = [item for item in serial_suite(unit) if item.id == "serial.unjudged.stars"]
+    with SimulatedUnit("serial") as simulated:
+        outcome = run_case(simulated.probe, case)
+    count, _, rest = outcome.seen.partition(" ")
+    assert rest.startswith("fields, such as star_magnitudes.magnitude_1 (stars[1].magnitude), ")
+    assert len(outcome.seen) < 250
+    listed = [line for line in outcome.log if line.startswith("not judged: ")]
+    assert len(listed) == int(count) > 20

@@ -268,3 +268,15 @@ def test_an_internal_error_of_the_console_is_logged(run, caplog, monkeypatch):
     assert [record.levelno for record in caplog.records if record.levelno >= logging.WARNING] == [
         logging.ERROR
     ]
+
+
+def test_a_request_with_more_headers_than_a_browser_sends_is_rejected(run):
+    async def scenario(emulation, _line):
+        address = emulation.ready_fields["view"]
+        async with aiohttp.ClientSession() as session:
+            for count, status in ((40, 200), (70, 400)):
+                headers = {f"X-{number}": "x" for number in range(count)}
+                async with session.get(address, headers=headers) as answer:
+                    assert answer.status == status
+
+    run(scenario, options=OPTIONS)

@@ -229,7 +229,12 @@ def time_runs(probe: LinkProbe) -> None:
     probe.sleep(1.0)
     third, last = probe.now(), _clock(probe)
     end = probe.now()
-    check(0.98 * (third - middle) <= last - first <= 1.02 * (end - begin) + 0.002, f"{third - middle:.3f} to {end - begin:.3f} s", f"{last - first:.3f} s")  # fmt: skip
+    least, most = third - middle, end - begin
+    check(
+        0.98 * least <= last - first <= 1.02 * most + 0.002,
+        f"{least:.3f} to {most:.3f} s",
+        f"{last - first:.3f} s",
+    )
 
 
 @TIME.case("flag", "device_status reports the same time, and that the clock was set", intrusive=True)

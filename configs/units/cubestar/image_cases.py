@@ -41,8 +41,9 @@ def _save(probe: LinkProbe) -> None:
 @IMAGES.case("none", "without a stored image a download is refused with code 7")
 def no_image(probe: LinkProbe) -> None:
     reset(probe)
-    for name, values in (("init_image_download", {"image_size": "size_64"}), ("advance_image_download", {"next_frame": 0}), ("start_burst", {})):  # fmt: skip
-        probe.expect_refused(name, SEQUENCE, **values)
+    probe.expect_refused("init_image_download", SEQUENCE, image_size="size_64")
+    probe.expect_refused("advance_image_download", SEQUENCE, next_frame=0)
+    probe.expect_refused("start_burst", SEQUENCE)
 
 
 @IMAGES.case("other-camera", "only the star camera exists", "CubeComputer TC 80, TLM 233 (AlbertaSat, CTS)")

@@ -175,6 +175,9 @@ static int step(struct unit *unit, double time, double size)
 
 static int set_start(struct unit *unit, double time)
 {
+    if (unit->phase != PREPARING || !isfinite(time)) {
+        return report(unit, ERROR, "start at %g s: must be a time, given before the simulation begins; reset the FMU to begin another", time);
+    }
     unit->values.numbers[TIME] = time;
     return OK;
 }

@@ -177,6 +177,10 @@ class FrameRequest:
     None: no correction."""
     preview: bool = False
     """Whether to return the image too, compressed for display."""
+    begin_s: float | None = None
+    """Simulation time at which the exposure begins, seconds; None: an image by itself, without an afterimage of others."""
+    pipeline_starts: int = 0
+    """How often the pipeline has been started: one that is restarted has lost the afterimage."""
 
 
 @dataclass(frozen=True)

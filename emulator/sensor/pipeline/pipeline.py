@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from starhil.emulator.errors import EmulatorError, one_line
 from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
 from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sensor.overexposure import Afterimage
 from starhil.emulator.sensor.pipeline.binning import mean_over_squares
 from starhil.emulator.sensor.pipeline.bodies import bodies_in_field, near_any, stars_seen, with_bodies
 from starhil.emulator.sensor.pipeline.image_source import ImageSource, open_images, used_bits
@@ -148,6 +149,8 @@ class Pipeline:
         self._last: _Exposure | None = None
         self.images: ImageSource | None = None
         """Source of images; None: they are rendered."""
+        self._afterimage: tuple[int, Afterimage | None] = (0, None)
+        """The charge left by exposures, and the start of the pipeline since which it has been left."""
         self._dark: DarkMap | None = None
         self._tracked: dict[float, StarCatalog] = {}
         self._calibration = None if setup.calibration is None else np.array(setup.calibration)
@@ -315,9 +318,24 @@ class Pipeline:
             temperature_c=request.temperature_c,
             objects=objects,
             observer=sky.observer,
+            satellites=sky.satellites,
+            afterimage=self._afterimage_for(request),
+            begin_s=request.begin_s or 0.0,
         )
         in_field = bodies_in_field(objects, attitude, self.camera)
         return _Exposure(frame.image, self._sensor.bits, frame.frame_index, in_field, frame, objects)
+
+    def _afterimage_for(self, request: FrameRequest) -> Afterimage | None:
+        """Return the afterimage of the exposures since the pipeline was started; None for an image by itself, or without traps."""
+        sensor = self._sensor
+        if request.begin_s is None or sensor.persistence_share == 0.0:
+            return None
+        starts, afterimage = self._afterimage
+        if afterimage is None or starts != request.pipeline_starts:
+            capacity_e = sensor.persistence_share * sensor.full_well_e
+            afterimage = Afterimage(sensor.full_well_e, capacity_e, sensor.persistence_s)
+            self._afterimage = request.pipeline_starts, afterimage
+        return afterimage
 
     def _without_dark(self, image: NDArray[Any], request: FrameRequest) -> NDArray[Any]:
         """Subtract the unit's dark frame, scaled to the exposure, gain and temperature of the image."""

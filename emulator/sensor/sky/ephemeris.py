@@ -83,6 +83,13 @@ class Observer:
         return sun
 
     @cached_property
+    def to_sun(self) -> Vector:
+        """Geometric direction (3,) of the Sun, ICRS."""
+        gap = self.sun - self.position_m
+        unit: Vector = gap / length(gap)
+        return unit
+
+    @cached_property
     def moon(self) -> Vector:
         """Barycentric position (3,) of the Moon when the light left it that arrives now, m, ICRS."""
         moon, velocity = self._motion[:, 2]

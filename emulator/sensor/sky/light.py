@@ -54,6 +54,10 @@ _GLOW_HEIGHTS: Final = 20.0
 _LIMB_STEPS: Final = 1024
 """Steps of the table of the limb, in which light is interpolated."""
 
+_EARTH_RINGS: Final = 24
+_EARTH_SECTORS: Final = 48
+"""Parts of the Earth's disc, of equal solid angle, whose stray light is added up."""
+
 _GRID_STEP: Final = 8
 """Pixels between the points that are examined for the part of an image that shows a body."""
 
@@ -117,6 +121,28 @@ def _is_lit(earth: EarthLimb, towards: Array, off_nadir_deg: float) -> bool:
     under = max(1.0 - square(distance * sin(angle)), 0.0)
     normal = (distance * cos(angle) - math.sqrt(under)) * line - distance * nadir
     return dot(normal, sun) > 0.0
+
+
+@lru_cache(maxsize=4)
+def _lit_parts(earth: EarthLimb) -> tuple[Array, Array]:
+    """Directions (n, 3), ICRS, of parts of the Earth's disc, and their light (n,) relative to that of the Sun, by Lambert's law."""
+    nadir, sun = earth.direction, earth.sun_direction
+    cosines = 1.0 - (1.0 - cos(earth.radius_rad)) * (np.arange(_EARTH_RINGS) + 0.5) / _EARTH_RINGS
+    sines = np.sqrt(1.0 - square(cosines))
+    turns = 2.0 * math.pi / _EARTH_SECTORS * np.arange(_EARTH_SECTORS)
+    across = np.array([1.0, 0.0, 0.0]) if abs(float(nadir[0])) < 0.5 else np.array([0.0, 1.0, 0.0])
+    side = across - dot(across, nadir) * nadir
+    side /= length(side)
+    ring = np.outer(elementwise(cos, turns), side) + np.outer(elementwise(sin, turns), np.cross(nadir, side))
+    directions = (cosines[:, None, None] * nadir + sines[:, None, None] * ring).reshape(-1, 3)
+    solid_angle = 2.0 * math.pi * (1.0 - cos(earth.radius_rad)) / len(directions)
+    light = np.full(len(directions), earth.albedo / math.pi * solid_angle)
+    if sun is not None:
+        distance = 1.0 / sin(earth.radius_rad)
+        cosine = np.repeat(cosines, _EARTH_SECTORS)
+        along = distance * cosine - np.sqrt(np.maximum(1.0 - square(distance) * (1.0 - square(cosine)), 0.0))
+        light *= np.maximum(along * product(directions, sun) - distance * dot(nadir, sun), 0.0)
+    return directions, light
 
 
 def _left_by_baffle(sun: SunGlare, attitude: Attitude) -> float:
@@ -183,6 +209,8 @@ class AreaPainter:
         glare = tuple(
             self._glare(body, attitude) for body in lights if _off_axis_deg(attitude, body) <= body.reach_deg
         )
+        if earth is not None and earth.stray_share > 0.0:
+            glare += self._earth_glare(earth, attitude)
         patches = [
             patch for body in lights if isinstance(body, Moon) for patch in self._disc_patch(body, attitude)
         ]
@@ -211,6 +239,30 @@ class AreaPainter:
             strength = _left_by_baffle(body, attitude) * self._scattered(body.disc) * reference
             return Glare(direction, strength, _chord(math.radians(_SUN_SOFT_DEG)), nearest, cube=True)
         return Glare(direction, self._scattered(body), math.radians(_GLARE_FROM_DEG), nearest, cube=False)
+
+    def _earth_glare(self, earth: EarthLimb, attitude: Attitude) -> tuple[Glare, ...]:
+        """Return the stray light of the Earth's lit disc, as that of one source; nothing if none of it enters the lens.
+
+        At the boresight it is that of the whole disc, each part of which the baffle dims as it dims the Sun; over the field it
+        varies as if all came from the mean direction. Light from behind the lens does not enter it.
+        """
+        directions, light = _lit_parts(earth)
+        chord2 = np.sum(square(directions - attitude.boresight), axis=1)
+        soft = _chord(math.radians(_SUN_SOFT_DEG))
+        softened = chord2 + square(soft)
+        weight = np.where(chord2 < 2.0, light, 0.0) / (softened * np.sqrt(softened))
+        total = float(np.sum(weight))
+        if total == 0.0:
+            return ()
+        mean = np.sum(weight[:, None] * directions, axis=0)
+        mean /= length(mean)
+        chord2_of_mean = float(np.sum(square(mean - attitude.boresight))) + square(soft)
+        sun = SunGlare(0.0, 0.0).disc
+        reference = _chord(math.radians(_SUN_REFERENCE_DEG))
+        strength = earth.stray_share * self._scattered(sun) * reference * total
+        strength *= chord2_of_mean * math.sqrt(chord2_of_mean)
+        outside = acos(max(min(dot(mean, attitude.boresight), 1.0), -1.0)) - self._camera.field_radius_rad
+        return (Glare(attitude.to_sensor(mean), strength, soft, _chord(max(outside, 0.0)), cube=True),)
 
     def _scattered(self, body: Moon) -> float:
         """Electrons/s per pixel that the lens scatters at an angle, times its square as chord.

@@ -119,6 +119,8 @@ class EarthLimb(CelestialBody):
     exclusion_deg: float = limited(0.0, 180.0, 0.0)
     """Angle between the boresight and the nearest point of the disc, if that is lit, within which its light passes
     the baffle and saturates the image; 0 for no baffle."""
+    stray_share: float = limited(0.0, 1.0, 0.0)
+    """Fraction that a baffle leaves of the light of the disc, as for the Sun, whose default is 1e-5; 0: none is scattered."""
     sun_ra_deg: float | None = limited(-360.0, 360.0, None)
     sun_dec_deg: float | None = limited(-90.0, 90.0, None)
     """Direction of the Sun, which lights the half of the Earth that faces it; by default all of the disc is lit."""
@@ -148,6 +150,22 @@ class PointSource(CelestialBody):
     """V magnitude in the sensor's band."""
     name: str = ""
     """Name in the truth."""
+
+
+@dataclass(frozen=True)
+class Constellation:
+    """Satellites on circular orbits around the Earth; the defaults are the first shell of Starlink."""
+
+    count: int = limited(1, 20_000, 1584)
+    """Number of satellites."""
+    planes: int = limited(1, 20_000, 72)
+    """Number of orbital planes, evenly spread over all nodes."""
+    altitude_km: float = limited(150.0, 50_000.0, 550.0)
+    """Altitude of all of them."""
+    inclination_deg: float = limited(0.0, 180.0, 53.0)
+    """Inclination of the planes."""
+    magnitude: float = limited(-20.0, 30.0, 5.9)
+    """V of one at a range of 1000 km, half lit (phase angle 90°)."""
 
 
 @dataclass(frozen=True)
@@ -187,6 +205,8 @@ class SkyObjects:
     """The bodies, if present."""
     planets: tuple[PointSource, ...] = listed(MAX_ROWS)
     """Point sources at fixed directions."""
+    satellites: Constellation | None = None
+    """Satellites whose trails cross the image; seen from an orbit."""
     obstructions: tuple[Obstruction, ...] = listed(MAX_ROWS)
     """Objects that cover parts of the image."""
     false_stars: int = limited(0, _MAX_OBJECTS, 0)
@@ -226,7 +246,7 @@ class SkyObjects:
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
         """Make sky objects from a table that is valid (`starhil.emulator.sensor.sky.tables`).
 
-        The keys are the fields of this class. Bodies are tables of their fields; `planets`, `catalog_errors` and
+        The keys are the fields of this class. Bodies and `satellites` are tables of their fields; `planets`, `catalog_errors` and
         `obstructions` are lists of tables. `blocked_share` adds an obstruction with a straight edge.
         """
         fields = dict(values)
@@ -234,6 +254,8 @@ class SkyObjects:
         for name, kind in BODY_KINDS.items():
             if fields.get(name) is not None:
                 fields[name] = kind(**fields[name])
+        if fields.get("satellites") is not None:
+            fields["satellites"] = Constellation(**fields["satellites"])
         fields["planets"] = tuple(PointSource(**row) for row in fields.get("planets", ()))
         fields["catalog_errors"] = tuple(CatalogError(**row) for row in fields.get("catalog_errors", ()))
         edge = [Obstruction(share=share)] if share else []

@@ -17,6 +17,7 @@ from starhil.emulator.sensor.sky.ephemeris import (
     sun_seen_by,
 )
 from starhil.emulator.sensor.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
+from starhil.emulator.sensor.sky.satellites import Satellites
 
 BodySource: TypeAlias = Literal["typed", "ephemeris"]
 """Where Sun, Moon, Earth and planets are: only where they are typed in, or where the date puts them."""
@@ -42,10 +43,11 @@ DATE_FIELDS: Final = {
 
 @dataclass(frozen=True)
 class SkyView:
-    """What a sensor sees at one time: objects, and the observer by whose motion the stars are displaced."""
+    """What a sensor sees at one time: objects, the observer by whose motion the stars are displaced, and satellites."""
 
     objects: SkyObjects
     observer: Observer | None = None
+    satellites: Satellites | None = None
 
 
 def has_aberration(values: Mapping[str, Any]) -> Any:
@@ -94,12 +96,15 @@ class Sky:
         `SkyObjects` that replace the profile's; of a body, its fields.
         """
         objects = self._with_faults(faults) if faults else self._typed
-        if unix_s is None or not (self.by_date or self._moving):
+        if unix_s is None:
             return SkyView(objects)
         observer = Observer(unix_s, position_m, velocity_m_s)
+        satellites = None
+        if objects.satellites is not None and position_m is not None and velocity_m_s is not None:
+            satellites = Satellites(objects.satellites, unix_s, position_m, velocity_m_s, observer.to_sun)
         if self.by_date:
             objects = self._with_bodies(objects, observer)
-        return SkyView(objects, observer if self._moving else None)
+        return SkyView(objects, observer if self._moving else None, satellites)
 
     def _with_faults(self, faults: Mapping[str, Any]) -> SkyObjects:
         """Return the typed objects, changed by faults; a body that a fault places looks as in the profile."""

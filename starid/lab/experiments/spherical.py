@@ -69,10 +69,11 @@ def compute(context: Context, part: Part) -> Results:
         attitude = propagate(attitude, np.radians(_SLEW_DEG), 1.0) if recursive else random_attitude(rng)
         xy, flux = points(rng, identifier.camera, identifier.catalog, attitude, part["noise"])
         begin = time.perf_counter()
-        if recursive and predicted is not None:
-            solution = identifier.track(xy, flux, predicted)
-        else:
-            solution = identifier.identify(xy, flux)
+        solution = (
+            identifier.track(xy, flux, predicted)
+            if recursive and predicted is not None
+            else identifier.identify(xy, flux)
+        )
         elapsed = 1e3 * (time.perf_counter() - begin)
         numbers[i, 2], numbers[i, 6], numbers[i, 7] = solution.valid, elapsed, solution.mode == "tracking"
         predicted = solution.attitude if solution.valid else None

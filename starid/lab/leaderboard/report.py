@@ -15,10 +15,10 @@ Answer = Mapping[str, Any]
 
 _HEAD: Final = """# Leaderboard of star identification
 
-`{command}`: all solvers are given the same scenes. A heading gives σ of the positions in px, and the numbers of false and of missing stars;
-unless it says otherwise, the field is 42° wide and shows stars to V 5.5. *Right* answers are within 0.1° of the true boresight and 1° of the
-true roll; in scenes without a sky, it is right not to answer. All other answers are *wrong*. *Ill-conditioned* answers are wrong answers
-within the same limits of the least-squares attitude of the true matches: no solver could do better with these stars.
+`{command}`: all solvers are given the same scenes. A heading gives σ of the positions in px, and the numbers of false and of missing
+stars; unless it says otherwise, the field is 42° wide and shows stars to V 5.5. *Right* answers are within 0.1° of the true boresight and
+1° of the true roll; in scenes without a sky, it is right not to answer. All other answers are *wrong*. *Ill-conditioned* answers are wrong
+answers within the same limits of the least-squares attitude of the true matches: no solver could do better with these stars.
 A solver that used up its time budget was given fewer scenes: compare no percentages before the number of scenes.
 """
 
@@ -38,7 +38,8 @@ def markdown(answer: Answer, command: str) -> str:
     lines += [
         "## Database, build time and memory",
         "",
-        "Size of the database; time to build it or, for geometric, lsi and rsi, to load it; growth of the process's memory until the first answer.",
+        "Size of the database; time to build it or, for geometric, lsi and rsi, to load it;",
+        "growth of the process's memory until the first answer.",
         "The published algorithms share the index for verification; its memory is counted for the first of them that runs.",
         "",
         "| solver | field | stars to V | database kB | build s | memory MB |",

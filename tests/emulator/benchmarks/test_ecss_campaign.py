@@ -24,7 +24,9 @@ OPTIONS = ["--fields", "12", "--rest-frames", "20", "--frames", "5", "--seed", "
 
 def campaign(folder, *settings: str, options: tuple = (), status: int = 0) -> dict:
     chosen = [word for setting in (*SMALL, *settings) for word in ("--set", setting)]
-    words = ["campaign", "--ecss", "--profile", PROFILE, *OPTIONS, *options, *chosen, "-o", str(folder)]
+    profile = folder / "a$_{`|<b>.toml"  # of which plots, tables and pages made markup
+    profile.write_text(f'extends = "{PROFILE}"\n', encoding="utf-8")
+    words = ["campaign", "--ecss", "--profile", str(profile), *OPTIONS, *options, *chosen, "-o", str(folder)]
     result = CliRunner().invoke(build_app(), words)
     assert result.exit_code == status, result.output
     return json.loads(result.stdout)
@@ -34,7 +36,7 @@ PROFILE = "ideal"
 LIMITS = """
 requirement = [
     { id = "R1", figure = "thermo_elastic.x", max = 30.0, text = "drift along the orbit" },
-    { id = "R2", figure = "thermo_elastic.z", max = 30.0 },
+    { id = "R2", figure = "thermo_elastic.z", max = 30.0, text = "<script>alert(1)</script> ![x](..) ![y](/etc/passwd) </td>" },
     { id = "R3", figure = "rest.correct", min = 99.0 },
     { id = "R4", figure = "rest.correct", min = 50.0 },
 ]
@@ -87,6 +89,7 @@ def test_an_injected_drift_is_found_and_the_campaign_is_resumed(tmp_path):
         for verdict in verdicts.values():
             assert verdict in text
     assert page.count("data:image/png;base64,") == 2
+    assert "<script" not in page
     printed = (tmp_path / "report.pdf").read_bytes()
     assert printed.startswith(b"%PDF-")
     assert printed.count(b"/Subtype /Image") == 2

@@ -336,7 +336,7 @@ def test_an_image_that_cannot_be_decoded_is_said_and_the_next_one_is_shown(page)
     said, painted = page.evaluate(
         """async () => {
             const { store, sky } = starhil;
-            while (sky.decoding) await new Promise(requestAnimationFrame);
+            for (let turns = 0; sky.decoding && turns < 1000; turns++) await new Promise((resolve) => setTimeout(resolve, 10));
             const { time, head } = store.image;
             store.images.push({ time: time + 1e-6, head, blob: new Blob([new Uint8Array(16)]) });
             await sky.show();
@@ -354,11 +354,11 @@ def test_a_page_that_connects_to_another_run_shows_nothing_of_the_run_before(pag
     *attitude, image = page.evaluate(
         """async () => {
             const { store, sky } = starhil;
-            while (sky.decoding) await new Promise(requestAnimationFrame);
+            for (let turns = 0; sky.decoding && turns < 1000; turns++) await new Promise((resolve) => setTimeout(resolve, 10));
             store.addImage = () => {};
             store.read = (buffer, offset, first, count) => offset + 16 * count + 4 * (store.hello.columns.length - 2) * count;
             store.message({ ...store.hello, run_id: "another" });
-            while (sky.decoding) await new Promise(requestAnimationFrame);
+            for (let turns = 0; sky.decoding && turns < 1000; turns++) await new Promise((resolve) => setTimeout(resolve, 10));
             return ["ra", "dec", "roll", "validity"].map((id) => document.getElementById(id).textContent).concat([sky.shown]);
         }"""
     )

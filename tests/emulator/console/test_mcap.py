@@ -2,6 +2,8 @@
 
 import base64
 import json
+import resource
+import shutil
 
 import pytest
 from mcap.reader import make_reader
@@ -183,6 +185,41 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(run, tmp_path, caplog):
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(said) == 1
     assert "run.mcap: cannot be written (No space left on device); it ends here" in said[0]
+
+
+@pytest.mark.parametrize("room", [3_000, 30_000])
+def test_a_recording_of_which_the_disk_became_full_can_be_read(run, tmp_path, monkeypatch, room):
+    """It had no end, and most readers rejected it."""
+    path = tmp_path / "run.mcap"
+    monkeypatch.setattr(recorder_module, "CHUNK_BYTES", 20_000)
+
+    async def scenario(emulation, _line):
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
+        try:
+            for _ in range(3):
+                await record(emulation)
+            await run.launched.close()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+    run(scenario, options=options(path))
+    assert run.launched.failed
+    assert path.stat().st_size <= room
+    assert bool(messages(path)) == (room == 30_000)
+
+
+def test_a_recording_of_a_run_that_was_killed_can_be_read(run, tmp_path, monkeypatch):
+    path, killed = tmp_path / "run.mcap", tmp_path / "killed.mcap"
+    monkeypatch.setattr(recorder_module, "CHUNK_BYTES", 20_000)
+
+    async def scenario(emulation, _line):
+        await record(emulation)
+        shutil.copy(path, killed)
+
+    run(scenario, options=options(path))
+    assert {*messages(killed)} <= {*messages(path)}
+    assert messages(killed)
 
 
 def test_what_happens_after_the_end_of_the_recording_is_no_error(run, tmp_path, caplog, monkeypatch):

@@ -20,7 +20,7 @@ from starhil.emulator.console.console import Console
 from starhil.emulator.console.history import COLUMNS, MODES, History, Image
 from starhil.emulator.console.reported_runs import ReportedRuns
 from starhil.emulator.console.trace import WireTrace
-from starhil.emulator.console.viewer import QUEUE_LIMIT, Viewer
+from starhil.emulator.console.viewer import PAUSE_S, QUEUE_LIMIT, TURN_ITEMS, Viewer
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.traffic import Decoder, WireItem
 from starhil.hil_tests.errors import BenchError
@@ -456,6 +456,35 @@ def test_nothing_is_sent_until_the_last_turn_is_acknowledged_and_then_the_newest
         assert (len(socket_.sent), head["messages"], head["image"]["n"], rest) == (2, [1, 2, 3], 3, b"jpeg 3")
         assert head["echo"][0] == 5.0
         assert head["echo"][1] <= head["at"]
+
+    asyncio.run(scenario())
+
+
+def test_a_page_gets_few_turns_however_much_happens_and_the_past_without_pauses():
+    async def scenario():
+        socket_, trace, events = KeepingSocket(), Numbers(0), Numbers(1000)
+        viewer = viewer_of(socket_, trace=trace, events=events)
+        viewer.subscribe(frames=True, wire=True, history=0, events=0)
+        pump = asyncio.create_task(viewer.pump())
+
+        async def happen(times):
+            before, count = len(socket_.sent), 0
+            for _ in range(times):
+                trace.end += 1
+                viewer.send("0", state="status")
+                await asyncio.sleep(0.002)
+                if len(socket_.sent) > before + count:
+                    count += 1
+                    viewer.acknowledge(None)
+            return count
+
+        loop = asyncio.get_running_loop()
+        past = await happen(50)  # six turns of events
+        assert past >= 1000 / TURN_ITEMS
+        begin = loop.time()
+        turns = await happen(200)
+        assert 2 <= turns <= (loop.time() - begin) / PAUSE_S + 2
+        pump.cancel()
 
     asyncio.run(scenario())
 

@@ -11,6 +11,8 @@ import pytest
 
 import starhil.protocol.transports.can
 from starhil.emulator.control.channel import MAX_LINE
+from starhil.emulator.device.cycle import MAX_AWAITED
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.run.truth_log import COLUMNS
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.file import read_truth_file
@@ -147,6 +149,60 @@ def test_a_slow_truth_file_holds_up_nothing_else(run, tmp_path, monkeypatch):
             go.set()
             assert (await swap)["ok"]
             assert (await control.do("truth", run_time_s=13.0))["roll_deg"] == pytest.approx(5.0)
+
+    run(scenario)
+
+
+def test_a_truth_that_is_set_later_does_not_wait_for_a_file_that_is_never_read(run, tmp_path, monkeypatch):
+    path = tmp_path / "truth.csv"
+    path.write_text("t,ra_deg,dec_deg,roll_deg\n0,10,20,0\n")
+    (tmp_path / "scenario.toml").write_text(
+        f'[[at]]\nrun_time_s = 1\ntruth = {{ kind = "file", path = "{path}" }}\n'
+    )
+    begun, go = threading.Semaphore(0), threading.Event()
+
+    def never(*_arguments):
+        begun.release()
+        assert go.wait(PATIENCE_S)
+        raise EmulatorError("too late")
+
+    monkeypatch.setattr("starhil.emulator.truth.reading_process.read_truth_file", never)
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control, Control(emulation) as other, Control(emulation) as third:
+            first = asyncio.create_task(control.do("set_truth", truth={"kind": "file", "path": str(path)}))
+            await asyncio.to_thread(begun.acquire)
+            second = asyncio.create_task(other.do("scenario", name=str(tmp_path / "scenario.toml")))
+            await asyncio.to_thread(begun.acquire)
+            answer = await third.do("set_truth", truth={"kind": "rate", "rate_deg_s": [0.0, 0.0, 2.0]})
+            assert (answer["ok"], (await third.do("status"))["truth_kind"]) == (True, "rate")
+            for waiting in (first, second):
+                assert "a later set_truth or scenario has taken its place" in (await waiting)["error"]
+            go.set()
+            assert (await third.do("status"))["truth_kind"] == "rate"
+
+    run(scenario)
+
+
+def test_a_limited_number_of_requests_awaits_an_exposure(run):
+    """In standby there is none; each request that gave up waiting was kept."""
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            await control.do("step", seconds=1.0)
+            for _ in range(MAX_AWAITED):
+                await control.do("fault", phase="exposure", device={"stuck": False})
+            for request in (
+                {"do": "fault", "phase": "exposure", "device": {"stuck": False}},
+                {"do": "wait", "phase": "readout", "within_s": 0.1},
+            ):
+                assert (
+                    "256 requests await the next exposure already"
+                    in (await control.raw(json.dumps(request).encode()))["error"]
+                )
+            command(emulation, "set_mode", mode="lost_in_space")
+            await control.do("step", seconds=2.0)
+            assert (await control.do("wait", phase="readout"))["ok"]
 
     run(scenario)
 

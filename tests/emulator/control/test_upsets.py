@@ -82,25 +82,20 @@ def test_a_stored_flip_shows_at_the_next_restart_and_survives_it(bench):
     assert bench.device.parameters["exposure"] == 100
 
 
-def test_a_saved_value_is_flipped_not_the_default(bench):
-    bench.device.parameters.set({"exposure": 96})
+@pytest.mark.parametrize(
+    ("name", "saved", "bit", "restarted"),
+    [("exposure", 96, 5, 64), ("update_rate", 2.0, 31, 1.0)],
+    ids=["the saved value is flipped, not the default", "an invalid flip is ignored"],
+)
+def test_a_stored_flip_shows_at_the_restart(bench, name, saved, bit, restarted):
+    bench.device.parameters.set({name: saved})
     bench.command("save_parameters")
     bench.step(1.0)
-    inject(bench, parameter="exposure", bit=5, stored=True)
-    bench.command("reset", magic=90)
-    bench.step(2.0)
-    assert bench.device.parameters["exposure"] == 64
-
-
-def test_a_stored_flip_that_is_invalid_is_ignored_at_the_restart(bench):
-    bench.device.parameters.set({"update_rate": 2.0})
-    bench.command("save_parameters")
-    bench.step(1.0)
-    inject(bench, parameter="update_rate", bit=31, stored=True)
+    inject(bench, parameter=name, bit=bit, stored=True)
     bench.command("reset", magic=90)
     bench.step(2.0)
     assert bench.mode == "standby"
-    assert bench.device.parameters["update_rate"] == bench.device.parameters.state.defaults["update_rate"]
+    assert bench.device.parameters[name] == restarted
 
 
 def test_a_stored_flip_in_the_catalogue_survives_a_restart_until_faults_are_cleared(bench):

@@ -50,6 +50,28 @@ def test_a_folder_that_cannot_be_created_is_rejected(tmp_path):
         FileStore(tmp_path / "file")
 
 
+def test_the_lock_follows_no_link_that_others_have_put_there(tmp_path):
+    folder, elsewhere = tmp_path / "state", tmp_path / "elsewhere"
+    folder.mkdir()
+    (folder / "lock").symlink_to(elsewhere)
+    with pytest.raises(EmulatorError, match=r"state folder .*: cannot be used .*--state-dir"):
+        FileStore(folder)
+    assert not elsewhere.exists()
+
+
+def test_a_corrupt_file_that_cannot_be_renamed_is_one_line(tmp_path, monkeypatch):
+    store = FileStore(tmp_path)
+    store.path.write_text("corrupt")
+
+    def read_only(*_arguments):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(type(store.path), "replace", read_only)
+    with pytest.raises(EmulatorError, match=r"device.json: is corrupt, and cannot be renamed .*; remove it$"):
+        store.load()
+    store.close()
+
+
 def damaged(data: bytes, kind: str) -> bytes:
     return {
         "truncated": data[: len(data) // 2],

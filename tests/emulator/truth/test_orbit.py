@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from starhil.emulator.truth.orbit import (
     interpolate_orbit,
 )
 from starhil.emulator.truth.source import FixedTruth, TruthState
+from starid.arithmetic.matrices import length
 from starid.attitude import Attitude
 from starid.catalog.earth import unix_time
 
@@ -131,6 +133,49 @@ def test_a_bad_tle_is_named_in_one_line(lines, said):
     with pytest.raises(EmulatorError, match=said) as caught:
         TleOrbit(*lines)
     assert "\n" not in str(caught.value)
+
+
+def summed(line):
+    """Return the 69 characters of a line of a TLE with its checksum."""
+    kept = line[:68].ljust(68)
+    return kept + str(sum(int(each) if each.isdecimal() else each == "-" for each in kept) % 10)
+
+
+@pytest.mark.parametrize(
+    ("changed", "old", "new", "said"),
+    [
+        (
+            0,
+            "00179.78495062",
+            "  00379.784950",
+            "day of the epoch must be a number from 1 to 367, not '00379.784950'",
+        ),
+        (0, "00179.78495062", "00000.78495062", "day of the epoch"),
+        (1, " 34.2682", "  1e5000", "inclination must be a number from 0 to 180, not '  1e5000'"),
+        (1, "348.7242", "348.724x", "right ascension of the node"),
+        (1, "1859667", "18-9667", "eccentricity"),
+        (1, "10.82419157", "00.00000000", "mean motion must be a number from 0.01 to 20"),
+    ],
+)
+def test_a_tle_whose_columns_are_shifted_is_rejected_though_its_checksum_is_right(changed, old, new, said):
+    """Such orbits were beyond Jupiter, or had no position at all."""
+    lines = list(VANGUARD)
+    assert old in lines[changed]
+    lines[changed] = summed(lines[changed].replace(old, new))
+    with pytest.raises(EmulatorError, match=re.escape(said)):
+        TleOrbit(*lines)
+
+
+def test_a_tle_that_leaves_the_earth_has_no_position():
+    """A drag term whose columns are shifted had the satellite beyond the stars the next day."""
+    first = "1 25544U 98067A   24001.50000000  .00016717     10270-3 0  9009     "
+    second = "2 25544  51.6400 208.9163 0006317  69.9862  25.2906 15.49560532    1"
+    orbit = TleOrbit(summed(first), summed(second))
+    start = unix_time("2024-01-01T12:00:00")
+    assert length(orbit.state(start).position_m) < 7e6
+    for days in (6, 7, 8, 30):
+        with pytest.raises(EmulatorError, match="TLE: has no position at the run's date"):
+            orbit.state(start + 86400.0 * days)
 
 
 def test_interpolated_states_lie_on_the_orbit():

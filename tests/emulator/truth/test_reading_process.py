@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import signal
 import stat
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -15,13 +17,22 @@ import numpy as np
 import pytest
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth import reading_process
 from starhil.emulator.truth.file import read_orbit_file, read_truth_file
-from starhil.emulator.truth.reading_process import AT_ONCE_BYTES, read_orbit, read_truth
+from starhil.emulator.truth.reading_process import (
+    AT_ONCE_BYTES,
+    LOOK_S,
+    MAX_PROCESSES,
+    NICER,
+    NICEST,
+    read_orbit,
+    read_truth,
+)
 from starhil.hil_tests.rig.emulator_process import installed_command
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.truth.test_standard_files import aem
-from tests.waiting import wait_until
+from tests.waiting import until, wait_until
 
 CSV = "t,qx,qy,qz,qw,wx_deg_s,wy_deg_s,wz_deg_s,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s\n" + "".join(
     f"{t},0,0,{np.sin(0.01 * t)},{np.cos(0.01 * t)},0,0,{np.degrees(0.02)},7e6,{t},0,0,7500,0\n"
@@ -207,21 +218,96 @@ def test_a_file_that_has_nothing_yet_is_rejected_without_waiting(
         os.close(writer)
 
 
-@pytest.mark.process
-def test_what_waits_too_long_for_a_file_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reading_process, "LONGEST_S", 1)
-    pipe = tmp_path / "pipe"
+def meta_kernel_of_a_pipe(folder: Path) -> Path:
+    pipe = folder / "pipe"
     os.mkfifo(pipe)
-    path = write(tmp_path / "meta", f"KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '{pipe}' )\n")
+    return write(folder / "meta", f"KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '{pipe}' )\n")
+
+
+@pytest.mark.process
+def test_a_file_of_which_nothing_arrives_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A pipe was waited for during an hour."""
+    monkeypatch.setattr(reading_process, "SILENT_S", 1)
+    with pytest.raises(
+        EmulatorError, match=r"cannot be read .nothing of it has arrived for 1 s; does it name a pipe"
+    ):
+        read_truth(meta_kernel_of_a_pipe(tmp_path))
+
+
+def test_a_folder_whose_server_does_not_answer_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer = threading.Event()
+    monkeypatch.setattr(reading_process, "SILENT_S", 0.2)
+    monkeypatch.setattr(reading_process, "_is_small_text", lambda _path: answer.wait())
+    try:
+        with pytest.raises(EmulatorError, match=r"orbit file .*: cannot be read .nothing of it has arrived"):
+            read_orbit(tmp_path / "orbit")
+    finally:
+        answer.set()
+
+
+ENDLESS = "import json, sys, time\nwhile time.monotonic() < {until}: json.dumps(0)\nprint(json.dumps({{'problems': ['read']}}))"
+
+
+@pytest.mark.process
+def test_a_file_that_is_still_being_read_is_waited_for_up_to_a_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, start = write(tmp_path / "truth", "KPL/MK\n"), subprocess.Popen
+
+    def busy(_command: list[str], **options: object) -> object:
+        return start([sys.executable, "-c", ENDLESS.format(until=time.monotonic() + 3)], **options)
+
+    monkeypatch.setattr(subprocess, "Popen", busy)
+    monkeypatch.setattr(reading_process, "SILENT_S", 1)
+    with pytest.raises(EmulatorError, match=r"^read$"):
+        read_truth(path)
+    monkeypatch.setattr(reading_process, "LONGEST_S", 1)
     with pytest.raises(EmulatorError, match=r"cannot be read .it takes longer than 1 s."):
         read_truth(path)
 
 
 @pytest.mark.process
+def test_what_reads_a_file_yields_to_the_run_and_ends_when_nobody_waits(tmp_path: Path) -> None:
+    """The file of a truth that was set meanwhile delayed replies tenfold, and was read to its end."""
+
+    async def scenario() -> None:
+        reading = asyncio.create_task(in_thread(read_truth, meta_kernel_of_a_pipe(tmp_path)))
+        await until(lambda: readers_of(os.getpid()))
+        (reader,) = readers_of(os.getpid())
+        niceness = min(NICEST, os.getpriority(os.PRIO_PROCESS, 0) + NICER)
+        await until(lambda: os.getpriority(os.PRIO_PROCESS, reader) == niceness)
+        reading.cancel()
+        await until(lambda: not is_alive(reader))
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.process
+def test_a_limited_number_of_processes_reads_at_a_time(tmp_path: Path) -> None:
+    """Each truth that replaced another before its file was read could have started one more."""
+    path = meta_kernel_of_a_pipe(tmp_path)
+
+    async def scenario() -> None:
+        reading = [asyncio.create_task(in_thread(read_truth, path)) for _ in range(MAX_PROCESSES + 3)]
+        await until(lambda: len(readers_of(os.getpid())) == MAX_PROCESSES)
+        await asyncio.sleep(2 * LOOK_S)
+        first = readers_of(os.getpid())
+        assert len(first) == MAX_PROCESSES
+        for task in reading[:MAX_PROCESSES]:
+            task.cancel()
+        await until(lambda: {*readers_of(os.getpid())} - {*first})
+        for task in reading:
+            task.cancel()
+        await until(lambda: not readers_of(os.getpid()))
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.process
 def test_what_reads_a_file_ends_with_the_run(tmp_path: Path) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
-    path = write(tmp_path / "meta", f"KPL/MK\n\\begindata\nKERNELS_TO_LOAD = ( '{pipe}' )\n")
+    path = meta_kernel_of_a_pipe(tmp_path)
     program = f"from starhil.emulator.truth.reading_process import *; read_truth(Path({str(path)!r}))"
     with subprocess.Popen([sys.executable, "-c", program]) as process:
         wait_until(lambda: readers_of(process.pid))

@@ -410,6 +410,7 @@ def test_a_quaternion_in_the_wrong_sense_is_rejected_by_its_rates(tmp_path: Path
 STK_HEAD = "stk.v.12.0\nBEGIN Attitude\n"
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -422,6 +423,7 @@ STK_HEAD = "stk.v.12.0\nBEGIN Attitude\n"
         (aem(ANGVEL_FRAME=""), "ANGVEL_FRAME is missing"),
         (aem("QUATERNION"), "7 numbers in a row of QUATERNION, which has 4"),
         (aem("QUATERNION", [f"{START} 0 0 0 2"]), "quaternion is not of length 1"),
+        (aem("QUATERNION", [f"{START} 0 0 0 1e200"]), "a number is outside ±1e+06"),
         (aem("QUATERNION", [f"{START} 0 0 0 x"]), "line 10: must be a date and numbers"),
         (aem("QUATERNION", ["20.3.2026 0 0 0 1"]), "not a date"),
         (aem("QUATERNION", [f"{START} 0 0 0 1"] * 2), "a date is not later"),

@@ -6,6 +6,7 @@ import asyncio
 import os
 import socket
 import subprocess
+import sys
 import threading
 import time
 from itertools import pairwise
@@ -273,6 +274,29 @@ def test_frames_wait_while_the_transmit_buffer_is_full_and_none_beyond_the_limit
         assert (len(bus.sent), bus.full, errors) == (QUEUE_LIMIT, 0, [])
         await transport.close()
         assert not transport.send(FRAMES[0])
+
+    asyncio.run(main())
+
+
+def test_frames_that_a_stalled_bus_has_not_taken_are_not_sent_when_it_comes_back() -> None:
+    """A node that was switched on after minutes received up to 10 000 old attitudes and heartbeats at once."""
+
+    async def main() -> None:
+        bus = _ScriptedBus()
+        transport, _, errors = await _open(bus)
+        bus.full = sys.maxsize  # nobody acknowledges
+        for _ in range(50):
+            transport.send(FRAMES[0])
+        await transport.drain()
+        transport.send(FRAMES[0])
+        await transport.drain()
+        assert (len(bus.sent), transport.statistics.dropped, errors) == (0, 51, [])
+        bus.full = 0
+        transport.send(FRAMES[1])
+        bus.full = 3  # and is waited for again
+        await transport.drain()
+        assert [message.arbitration_id for message in bus.sent] == [FRAMES[1].id]
+        await transport.close()
 
     asyncio.run(main())
 

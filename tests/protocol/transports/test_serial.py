@@ -243,6 +243,27 @@ def test_the_symlink_replaces_a_stale_one_and_is_removed_at_close(tmp_path: Path
     asyncio.run(main())
 
 
+def test_a_symlink_that_cannot_be_replaced_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one of another user in /tmp."""
+    link = tmp_path / "tty"
+    link.symlink_to("/nowhere")
+
+    def not_permitted(*_arguments: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    async def main() -> None:
+        transport = open_serial("auto", symlink=link)
+        with pytest.raises(TransportError, match=r"cannot make the symlink .*: Operation not permitted"):
+            await transport.start(lambda _: None)
+        await transport.close()
+
+    monkeypatch.setattr(type(link), "replace", not_permitted)
+    asyncio.run(main())
+    assert list(tmp_path.iterdir()) == [link]
+
+
 def test_a_symlink_taken_over_by_another_is_left_alone(tmp_path: Path) -> None:
     async def main() -> None:
         link = tmp_path / "tty"

@@ -45,6 +45,21 @@ def test_beta_lyrae_has_two_minima_without_rest_between() -> None:
     assert light == pytest.approx([4.36, 3.25, 3.85, 3.25], abs=1e-6)
 
 
+def test_epsilon_aurigae_is_eclipsed_when_it_was() -> None:
+    """First contact at the end of August 2009 (Hopkins, campaign newsletter 14), 3.7 to 3.8 on 3 February 2010 (AAVSO special notice
+    192); the curve here has no flat bottom, so that it is brighter on the way."""
+    light = curve("epsilon Aurigae", np.array([2_454_960.0, 2_455_230.5, 2_455_397.0, 2_455_850.0]))
+    assert light[[0, 3]] == pytest.approx(2.92, abs=0.01)
+    assert 3.4 < light[1] < 3.8 < light[2] < 3.9
+
+
+def test_chi_cygni_is_brightest_within_weeks_of_its_maximum_of_late_may_2013() -> None:
+    days = 2_456_439.5 + np.arange(-150.0, 150.0)
+    light = curve("chi Cygni", days)
+    assert abs(days[np.argmin(light)] - 2_456_439.5) < 30.0
+    assert light.min() == pytest.approx(3.3, abs=0.01)
+
+
 def test_curves_are_continuous() -> None:
     for star in VARIABLE_STARS:
         days = np.linspace(0.0, star.period_d, 4001)

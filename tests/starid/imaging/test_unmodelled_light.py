@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from starid.imaging import detection
 from starid.imaging.detection import DetectionSettings, detect
+from starid.imaging.unmodelled_light import shift_by_hidden_stars
 
 SIGMA_PX = 0.8
 WIDTH_PX = math.sqrt(SIGMA_PX**2 + 1.0 / 12.0)
@@ -53,7 +53,7 @@ def test_stars_hidden_in_a_trail_shift_it_by_the_stated_mean_square() -> None:
             )
     squares *= step**2
     size = (100, 50)
-    stated = detection._shift_by_hidden_stars(
+    stated = shift_by_hidden_stars(
         np.array([FLUX, share * FLUX]), np.array([length, length]), SIGMA_PX, size
     )[0] ** 2 * (size[0] * size[1])
     assert stated == pytest.approx(squares, rel=0.2)
@@ -61,7 +61,7 @@ def test_stars_hidden_in_a_trail_shift_it_by_the_stated_mean_square() -> None:
 
 def test_brighter_neighbours_are_resolved_and_do_not_count() -> None:
     flux = np.array([FLUX, 0.5 * FLUX])
-    assert not detection._shift_by_hidden_stars(flux, np.array([10.0, 10.0]), SIGMA_PX, (100, 100)).any()
+    assert not shift_by_hidden_stars(flux, np.array([10.0, 10.0]), SIGMA_PX, (100, 100)).any()
 
 
 @pytest.mark.parametrize(("x", "y"), [(103.2, 40.7), (100.4, 43.1), (97.1, 37.6)])

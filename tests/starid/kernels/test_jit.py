@@ -283,6 +283,23 @@ def test_a_cache_that_can_only_be_read_is_used(
     assert (copy / "package" / "kernel.nbc").read_bytes() == b"code"
 
 
+def test_a_cache_that_can_be_neither_written_nor_copied_is_one_line(
+    cache_folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The line had the name and the reason of every kernel."""
+    (cache_folder / "kernels" / kernel_cache.sources_key()).mkdir(parents=True)
+    monkeypatch.setattr("starid.kernels.kernel_cache.os.access", lambda *_arguments: False)
+
+    def full(*_arguments: object, **_options: object) -> None:
+        raise kernel_cache.shutil.Error([("a.nbc", "copy", "no space"), ("b.nbc", "copy", "no space")])
+
+    monkeypatch.setattr(kernel_cache.shutil, "copytree", full)
+    assert not kernel_cache.use_kernel_cache()
+    assert [each.getMessage() for each in caplog.records] == [
+        "kernels cannot be cached (no space): each process compiles them"
+    ]
+
+
 def test_the_machine_code_of_former_sources_is_evicted_beyond_the_limit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,7 +6,7 @@ import { colour, onTheme, pen } from "./theme.js";
 
 const WINDOWS = [[60, "1 min"], [300, "5 min"], [900, "15 min"], [3600, "1 h"]];
 const MAX_POINTS = 900;
-const REDRAW_MS = 200; // shortest time between two drawings; a span of an hour changes by a point in four seconds
+const REDRAW_MS = 500; // shortest time between two drawings; a minute moves by less than a hundredth meanwhile
 const SPOKEN_MS = 5000;
 const GAP_S = 20; // frames that are farther apart are not joined
 const MAX_MARKS = 300;
@@ -100,7 +100,9 @@ export class Charts {
     this.due = true;
     const period = Math.max(REDRAW_MS, this.window / 1.8);
     const wait = this.store.cursor === null ? Math.max(0, this.last + period - performance.now()) : 0;
-    setTimeout(() => requestAnimationFrame(() => this.redraw()), wait);
+    const draw = () => requestAnimationFrame(() => this.redraw());
+    if (wait) setTimeout(draw, wait);
+    else draw();
   }
 
   // --- plots that the user puts together ---
@@ -195,8 +197,9 @@ export class Charts {
     });
     const own = { plan, outputs, range: [0, 1], scale: 0, u: null, box: null };
     const name = plan.title || plan.series.map((each) => each.name).join(", ");
-    legend.append(make("span", { class: "spacer" }), make("button", { type: "button", class: "small", text: "⤓", title: "save as PNG", "aria-label": `save the plot ${name} as PNG`, onclick: () => this.png(own) }));
-    if (plan.own) legend.append(make("button", { type: "button", class: "small", text: "×", "aria-label": `remove the plot ${name}`, onclick: () => { this.own = this.own.filter((each) => each !== plan); this.changed(); } }));
+    const corner = make("span", { class: "corner" }, make("button", { type: "button", class: "small", text: "⤓", title: "save as PNG", "aria-label": `save the plot ${name} as PNG`, onclick: () => this.png(own) }));
+    legend.append(corner);
+    if (plan.own) corner.append(make("button", { type: "button", class: "small", text: "×", "aria-label": `remove the plot ${name}`, onclick: () => { this.own = this.own.filter((each) => each !== plan); this.changed(); } }));
     const box = make("div", { class: "plot" }, legend);
     this.host.append(box);
     if (folded) return own;

@@ -4,7 +4,7 @@ import { toSky } from "./directions.js";
 import { drawRegion } from "./features.js";
 import { colour, onTheme, pen } from "./theme.js";
 
-const REDRAW_MS = 200;
+const REDRAW_MS = 500;
 const RAD = Math.PI / 180;
 const TRAIL_POINTS = 600;
 const SIDE_PARTS = 48; // of a side of the field of view: near a pole its right ascension changes fast

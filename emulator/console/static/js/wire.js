@@ -8,6 +8,7 @@ const SHOWN_LINES = 400;
 const PAUSE_MS = 100;
 const FLOOD_PAUSE_MS = 1000; // between two renderings of more lines than anyone can read
 const FLOOD_LINES = 50;
+const FLOOD_SHOWN_LINES = 100; // of those, the newest; a filter shows the others that are kept
 const HUES = 6;
 const KINDS = [["requests", ["telecommand", "telemetry"]], ["replies", ["ack", "reply"]], ["refusals, faults", ["nack", "fault"]], ["parts", ["part"]], ["CANopen", ["canopen"]]];
 
@@ -93,7 +94,7 @@ export class Wire {
     if (!again && (this.held || this.store.cursor !== null)) return;
     if (again) this.list.replaceChildren();
     const newest = this.list.firstElementChild ? Number(this.list.firstElementChild.dataset.n) : -1;
-    const fresh = this.lines.filter((line) => line.n > newest && this.wanted(line)).slice(-SHOWN_LINES);
+    const fresh = this.lines.filter((line) => line.n > newest && this.wanted(line)).slice(-(this.fresh > FLOOD_LINES && !again ? FLOOD_SHOWN_LINES : SHOWN_LINES));
     let before = this.list.firstElementChild ? Number(this.list.firstElementChild.dataset.t) : null;
     const items = fresh.map((line) => {
       const item = this.item(line, before);

@@ -29,7 +29,7 @@ def frame(magnitudes=(2.0, 7.0), xy=((50.0, 40.0), (60.0, 20.0))):
     )  # fmt: skip
     image = np.full((100, 200), 9, dtype=np.uint8)
     image[40, 50] = 250
-    objects = ObjectTruth(np.array([[3.0, 4.0]]), np.zeros((0, 2)), np.zeros((0, 4)), 0.0)
+    objects = ObjectTruth(np.array([[3.0, 4.0]]), np.zeros((0, 2)), np.zeros((0, 4)), np.zeros((0, 4)), 0.0)
     return Frame(image, stars, POINTING, (0.0, 0.0, 0.0), 0.1, 1, 1, objects)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from starhil.emulator.sensor.renderer import Renderer
-from starhil.emulator.sensor.sky.catalog_errors import displaced
 from starhil.emulator.sensor.sky.objects import CatalogError, SkyObjects
+from starhil.emulator.sensor.sky.stars import displaced
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
