@@ -246,7 +246,10 @@ def _common_velocity(series: ErrorSeries, confidence: float) -> tuple[Vectors, V
     limit = rest_ms * float(f_distribution.isf(SIGNIFICANCE, rank, left))
     significant = float(np.sum(explained**2)) > rank * limit
     covariance = rest_ms * np.linalg.pinv(matrix.T @ matrix, rcond=1e-9)
-    speeds = _speeds(velocity.reshape(-1, 3), covariance.reshape(len(dates), 3, len(dates), 3))
+    speeds = _speeds(
+        np.asarray(velocity, dtype=np.float64).reshape(-1, 3),
+        covariance.reshape(len(dates), 3, len(dates), 3),
+    )
     turns = np.outer(speeds, np.linspace(0.0, 1.0, _TURNS))
     size = np.full(2, np.quantile(turns, confidence) if significant else 0.0)
     return size, np.full(2, math.sqrt(2.0 * rank * limit / error.size))
