@@ -202,6 +202,8 @@ class _Tally:
         self._errors: list[tuple[float, float]] = []
         """Of each image across and about the boresight, degrees; infinite without an attitude."""
         self._normalised: list[np.ndarray] = []
+        self._sequence: list[int] = []
+        """Of each valid attitude, its sequence."""
         self._stated: list[float] = []
         self._ms: list[float] = []
         self._in_region = self._triggers = 0
@@ -231,6 +233,7 @@ class _Tally:
         self._ms.append(elapsed_ms)
         if solution.valid:
             self._judge(solution, image.request.truth.attitude)
+            self._sequence.append(image.number // self._scene.length)
         else:
             self._errors.append((math.inf, math.inf))
         if solution.features is not None:
@@ -265,6 +268,17 @@ class _Tally:
             f"{name}_error_pct": None if error is None else 100.0 * error,
         }
 
+    def _squared_error_sampling(self) -> float | None:
+        """Standard error of the normalised squared error, from independent sequences; None if there are fewer than two."""
+        each, sequence = np.mean(np.array(self._normalised).reshape(-1, 3), axis=1), np.array(self._sequence)
+        excess = [float(np.sum(each[sequence == one] - each.mean())) for one in np.unique(sequence)]
+        count = len(excess)
+        return (
+            math.sqrt(count / (count - 1) * float(np.sum(np.square(excess)))) / len(each)
+            if count > 1
+            else None
+        )
+
     def figures(self, name: str) -> dict[str, Any]:
         """Figures of the condition: shares of all images, errors of valid attitudes in degrees, times of the processor."""
         each = np.array(self._errors)
@@ -283,6 +297,7 @@ class _Tally:
             "about_deg": float(np.median(errors[:, 1])) if valid else None,
             "stated_deg": float(np.median(self._stated)) if valid else None,
             "normalised_squared_error": float(np.mean(self._normalised)) if valid else None,
+            "normalised_squared_error_error": self._squared_error_sampling(),
             "in_region": self._in_region,
             "triggers": self._triggers,
             "true_kept_pct": 100.0 * true[1] / true.sum() if true.sum() else None,

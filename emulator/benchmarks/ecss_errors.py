@@ -31,6 +31,9 @@ BIAS: Final = "bias"
 THERMO_ELASTIC: Final = "thermo-elastic error"
 ABERRATION: Final = "aberration residual"
 
+_TURNS: Final = 2001
+"""Number of directions for which the turn by a velocity is computed."""
+
 Vectors = Array
 Labels = Indices
 
@@ -185,10 +188,10 @@ def static_errors(
 def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confidence: float) -> ErrorLine:
     """Return the error that differs between dates: the aberration that the device does not correct.
 
-    The conditions of the first series are dates. Across the boresight, the size is the quantile over fields and dates of
-    the turn that a velocity common to all fields explains, one velocity for each date, relative to the mean of the field:
-    over a year it is a sinusoid, bounded, which a multiple of its standard deviation would exceed. What differs between
-    fields for other reasons, such as stars that cross pixels, is left out. About the boresight, aberration turns a field
+    The conditions of the first series are dates. Across the boresight, the size is the quantile, over all directions of the sky
+    and the dates, of the turn by the velocity that all fields have in common, relative to the mean of the dates. A turn has the speed
+    as its bound, which a multiple of its standard deviation would exceed. What differs between fields for other reasons, such
+    as stars that cross pixels, is left out. About the boresight, aberration turns a field
     only as far as its stars are unevenly distributed; that is a multiple of the standard deviation, without the
     pixel spatial error in the second series (see `static_errors`). If a series is None, the line is not evaluated.
     """
@@ -209,7 +212,8 @@ def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confiden
 def _common_velocity(series: ErrorSeries, confidence: float) -> tuple[Vectors, Vectors]:
     """Return the turn about x and y due to one velocity for each condition, 0 if not significant, and the smallest significant (2,).
 
-    A velocity v, in units of c and the sensor frame, turns a sensor that does not correct it by (−v_y, v_x).
+    A velocity v, in units of c and the sensor frame, turns a sensor that does not correct it by (−v_y, v_x). In a random direction of
+    the sky, the turn about an axis is uniform up to the speed (Archimedes).
     """
     from scipy.stats import f as f_distribution
 
@@ -241,8 +245,32 @@ def _common_velocity(series: ErrorSeries, confidence: float) -> tuple[Vectors, V
     rest_ms = float(np.sum((error - explained) ** 2)) / left
     limit = rest_ms * float(f_distribution.isf(SIGNIFICANCE, rank, left))
     significant = float(np.sum(explained**2)) > rank * limit
-    size = np.quantile(np.abs(explained), confidence, axis=0, method="higher")
-    return np.where(significant, size, 0.0), np.full(2, math.sqrt(2.0 * rank * limit / error.size))
+    covariance = rest_ms * np.linalg.pinv(matrix.T @ matrix, rcond=1e-9)
+    speeds = _speeds(
+        np.asarray(velocity, dtype=np.float64).reshape(-1, 3),
+        covariance.reshape(len(dates), 3, len(dates), 3),
+    )
+    turns = np.outer(speeds, np.linspace(0.0, 1.0, _TURNS))
+    size = np.full(2, np.quantile(turns, confidence) if significant else 0.0)
+    return size, np.full(2, math.sqrt(2.0 * rank * limit / error.size))
+
+
+def _speeds(velocity: Vectors, covariance: Array) -> Vectors:
+    """Lengths (k,) of fitted velocities (k, 3) without the length that their errors add, by their covariance (k, 3, k, 3).
+
+    The errors make a mean square too large by the trace of the covariance, and the largest of several speeds too large by
+    their scatter. If the scatter is not significantly larger than that of the errors, all speeds are the same.
+    """
+    from scipy.stats import chi2
+
+    own = np.einsum("iaib->iab", covariance)
+    squares = np.sum(velocity**2, axis=1) - np.trace(own, axis1=1, axis2=2)
+    variance = 4.0 * np.einsum("ia,iab,ib->i", velocity, own, velocity) + 2.0 * np.sum(own**2, axis=(1, 2))
+    mean, dof = squares.mean(), len(squares) - 1
+    limit = float(variance.mean()) * float(chi2.isf(SIGNIFICANCE, dof))
+    if np.sum((squares - mean) ** 2) <= limit:
+        squares = np.full(len(squares), mean)
+    return np.asarray(np.sqrt(np.maximum(squares, 0.0)))
 
 
 def thermo_elastic_error(series: ErrorSeries, confidence: float) -> ErrorLine:

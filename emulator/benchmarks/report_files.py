@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 FONT_PT: Final = 8.0
+CELL_PADDING_MM: Final = 0.4
 _IMAGE: Final = re.compile(r'(<img src=")([\w.-]+)(")')
 _MARKS: Final = re.compile(r"[!-/:-@\[-`{-~]")
 """Characters that Markdown may take for marks, and a backslash makes plain."""
@@ -72,6 +73,7 @@ def as_pdf(markdown: str, title: str, folder: Path) -> bytes:
     heading = partial(TextStyle, "report", "B", color=(20, 40, 80), t_margin=4, b_margin=2)
     body = _IMAGE.sub(lambda image: f'{image[1]}{folder / image[2]}" width="520{image[3]}', _body(markdown))
     body = _EMPHASIS.sub("", body).replace("<td>", '<td align="left">').replace("<th>", '<th align="left">')
+    body = body.replace("<table>", f'<table cellpadding="{CELL_PADDING_MM}">')
     pdf.write_html(
         body,
         font_family="report",
@@ -79,6 +81,7 @@ def as_pdf(markdown: str, title: str, folder: Path) -> bytes:
         tag_styles={
             "h1": heading(font_size_pt=16),
             "h2": heading(font_size_pt=11),
+            "p": TextStyle("report", font_size_pt=FONT_PT, t_margin=1, b_margin=2),
             "li": TextStyle("report", font_size_pt=FONT_PT, l_margin=4),
         },
     )

@@ -55,6 +55,7 @@ _ALGORITHM_COLUMNS: Final[tuple[Column, ...]] = (
     ("about deg", _number("about_deg", 4)),
     ("stated deg", _number("stated_deg", 4)),
     ("chi2", _number("normalised_squared_error", 2)),
+    ("1 SE", _number("normalised_squared_error_error", 2)),
     ("region", lambda row: str(row["in_region"])),
     ("triggers", lambda row: str(row["triggers"])),
     ("stars kept %", _number("true_kept_pct", 0)),

@@ -129,7 +129,9 @@ def command(
         Path | None,
         typer.Option(help=output_help("Write an HTML report with the sent, expected and received data.")),
     ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Print passed cases too.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Print passed cases too, and what no case judges.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Test a star sensor, emulated or real, over its bus.
@@ -142,9 +144,11 @@ def command(
     received data.
     """
     from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     from starhil.hil_tests.conformance import report
     from starhil.hil_tests.conformance.conformance_run import all_cases, run_conformance
+    from starhil.hil_tests.conformance.runner import Outcome
     from starhil.hil_tests.reports import prepare_report
     from starhil.hil_tests.rig.interruption import interruptible
 
@@ -158,10 +162,21 @@ def command(
     for path in (junit, html):
         if path is not None:
             prepare_report(path)
-    with interruptible():
-        result = run_conformance(
-            request, lambda outcome: report.print_outcome(console, outcome, verbose=verbose)
-        )
+    total = len(all_cases(request))
+    with (
+        interruptible(),
+        Progress(
+            BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"),
+            console=console, transient=True, disable=not console.is_terminal or as_json,
+        ) as progress,
+    ):  # fmt: skip
+        bar = progress.add_task("starting" if request.start else "", total=total)
+
+        def show(outcome: Outcome) -> None:
+            progress.update(bar, advance=1, description=outcome.id)
+            report.print_outcome(console, outcome, verbose=verbose)
+
+        result = run_conformance(request, show)
         outcomes = result.outcomes
         if junit is not None:
             report.write_junit_report(junit, outcomes)

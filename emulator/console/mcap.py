@@ -40,8 +40,8 @@ log = logging.getLogger("starhil.record")
 MAX_PENDING: Final = 64
 """Write-queue limit; further messages are dropped."""
 
-CHUNK_BYTES: Final = 1 << 20
-"""Size of the chunks in which messages are compressed and written."""
+CHUNK_BYTES: Final = 1 << 18
+"""Size of the chunks in which messages are compressed and written; the last one is lost if the run is killed."""
 
 MCAP_TIMES_NS: Final = range(1 << 64)
 """Times that an MCAP file can hold: Unix time, nanoseconds."""

@@ -47,9 +47,8 @@ from starhil.emulator.truth.source import TruthState
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.icd.values import Value
 from starid.arithmetic.arrays import Array
-from starid.arithmetic.elementary import square
 from starid.arithmetic.matrices import length
-from starid.attitude import ARCSEC_PER_RAD, Attitude
+from starid.attitude import Attitude
 from starid.identification.attitude_history import AttitudeHistory
 
 log = logging.getLogger("starhil.device")
@@ -435,10 +434,7 @@ class FrameCycle:
                 self._history.interrupt()
             return False, result.reason, None
         attitude = Attitude(np.array(result.quaternion_xyzw))
-        across, about = (
-            sigma / ARCSEC_PER_RAD for sigma in (result.sigma_cross_arcsec, result.sigma_roll_arcsec)
-        )
-        known = np.diag([square(across), square(across), square(about)]) if min(across, about) > 0.0 else None
+        known = None if result.covariance_rad2 is None else np.array(result.covariance_rad2)
         self._history.add(frame.mid_ns, attitude, LONGEST_GAP_PERIODS * frame.period_s, known)
         rate = result.rate_rad_s or self._history.rate()
         if processing_s * 1000.0 > float(self._parameters["detection_timeout"]):

@@ -87,7 +87,9 @@ class CameraConfig(Strict):
         if self.focal_mm is not None:
             focal_px = 1000.0 * values.pop("focal_mm") / pixel_um
             values["focal_px"] = [focal_px, focal_px]
-        if "focal_px" not in values:
+        if "focal_px" in values:
+            values.setdefault("centre_px", [(self.width - 1) / 2, (self.height - 1) / 2])
+        else:
             values.setdefault("fov_deg", 42.0)
         return values
 

@@ -50,6 +50,9 @@ log = logging.getLogger("starhil.truth")
 TYPES: Final = {"QUATERNION": 4, "EULER_ANGLE": 3, "QUATERNION/ANGVEL": 7, "EULER_ANGLE/ANGVEL": 6}
 """Attitude types that are read, and the numbers in a row of each."""
 
+DOCTYPE: Final = "<!DOCTYPE"
+"""Begins declarations of entities and default attributes, which could make a small file take any amount of memory."""
+
 MAX_NUMBER: Final = 1e6
 """Largest number in a row of attitudes; angles may exceed a turn."""
 
@@ -252,8 +255,10 @@ def _from_kvn(where: str, kind: str, text: str) -> tuple[str | None, list[Segmen
 
 
 def _from_xml(where: str, kind: str, text: str) -> tuple[str | None, list[Segment]]:
+    if DOCTYPE in text:
+        raise EmulatorError(f"{where}: has a DOCTYPE, which no CCSDS message has; remove it")
     try:
-        root = ET.fromstring(text)  # noqa: S314 (expat limits the expansion of entities)
+        root = ET.fromstring(text)  # noqa: S314 (without entities and default attributes)
     except (ET.ParseError, ValueError) as error:
         raise EmulatorError(f"{where}: not XML ({error})") from None
     message = next((node for node in root.iter() if _name(node) == kind.lower()), None)

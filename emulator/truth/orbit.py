@@ -175,6 +175,9 @@ class TleOrbit:
             raise EmulatorError(f"orbit: TLE: {why}; copy both lines again") from None
         if self._satellite.error:
             raise EmulatorError(f"orbit: TLE: {_sgp4_error(self._satellite.error)}; give a current TLE")
+        motion_rad_s = 2.0 * math.pi * float(line2[TLE_FIELDS["mean motion"][1]]) / DAY_S
+        self._cubed_axis_m3 = EARTH_GM_M3_S2 / square(motion_rad_s)
+        """Cube of the semi-major axis, twice which no ellipse reaches: SGP4 diverges for a false drag term."""
 
     def state(self, unix_s: float) -> OrbitState:
         """Return position and velocity at a Unix time."""
@@ -191,7 +194,9 @@ class TleOrbit:
         c, s = cos(equinoxes), sin(equinoxes)
         to_gcrs = product(erfa.pnm00b(*tt).T, np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
         position, velocity = (product(to_gcrs, 1e3 * np.array(each)) for each in (position_km, velocity_km_s))
-        if not np.isfinite([position, velocity]).all():
+        distance_m = length(position)
+        within = distance_m * distance_m * distance_m < 10.0 * self._cubed_axis_m3
+        if not (within and length(velocity) < math.inf):
             raise EmulatorError("orbit: TLE: has no position at the run's date; give a current TLE")
         return OrbitState(on_grid(position, _POSITION_GRID_M), on_grid(velocity, VELOCITY_GRID_M_S))
 

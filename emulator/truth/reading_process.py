@@ -58,8 +58,11 @@ MAX_PROCESSES: Final = 4
 
 _ROOM: Final = threading.BoundedSemaphore(MAX_PROCESSES)
 
-NICENESS: Final = 15
-"""Priority of the process, so that the bus and the pipeline are served first."""
+NICER: Final = 15
+"""By how much the process is nicer than the run, so that the bus and the pipeline are served first."""
+
+NICEST: Final = 19
+"""Lowest priority of a process."""
 
 Kind: TypeAlias = Literal["truth", "orbit"]
 Content = TypeVar("Content")
@@ -159,7 +162,8 @@ def _process(kind: Kind, path: Path) -> Iterator[subprocess.Popen[bytes]]:
     try:
         command = [sys.executable, "-P", "-m", __name__, kind, str(path), str(os.getpid())]
         with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE) as process:  # noqa: S603
-            os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
+            niceness = min(NICEST, os.getpriority(os.PRIO_PROCESS, 0) + NICER)
+            os.setpriority(os.PRIO_PROCESS, process.pid, niceness)
             yield process
     finally:
         _ROOM.release()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
@@ -40,6 +41,7 @@ from starhil.hil_tests.rig.temporary_folder import temporary_folder
 from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.protocol.errors import IcdError
 from starhil.protocol.files.bundled import DEFAULT_UNIT
+from starhil.protocol.files.user_file import read_user_file
 from starhil.protocol.serial.stack import chosen_dialect
 from starhil.protocol.transports.can import open_can
 from starhil.protocol.transports.serial import open_serial
@@ -51,6 +53,13 @@ if TYPE_CHECKING:
 
 POINTING: Final = from_radec_roll(90.0, -30.0, 45.0)
 """Attitude of an emulator that a run starts: in any naming of the axes, a conjugated quaternion is at least 19 deg off."""
+
+
+LONGEST_LINE: Final = 1000
+"""Longest line of an EDS, of which CiA 306 allows 255 characters: Python's reader takes a time that grows with its square."""
+
+WRONG_VALUES: Final = (ValueError, KeyError, TypeError, AttributeError, IndexError)
+"""What the package canopen raises for values that no EDS has."""
 
 
 @dataclass(frozen=True)
@@ -300,7 +309,7 @@ def _canopen_probe(request: ConformanceRequest, unit: Unit, can: str, stack: Exi
         path.write_text(text, encoding="utf-8")
         try:
             dictionary = import_od(str(path), node)
-        except (canopen.ObjectDictionaryError, ValueError, KeyError) as error:
+        except (canopen.ObjectDictionaryError, configparser.Error, *WRONG_VALUES) as error:
             raise BenchError(f"{request.eds}: not a valid EDS: {error}") from None
     bus = stack.enter_context(LivePort(open_can(can), request.speed))
     return CanopenProbe(bus, node, dictionary, text, entries(unit, unit.canopen))
@@ -314,6 +323,9 @@ def _eds_text(request: ConformanceRequest) -> str:
 
         return build_eds(DeviceDictionary(load_unit(request.unit or DEFAULT_UNIT)))
     try:
-        return path.read_text(encoding="utf-8", errors="replace")
+        text = read_user_file(path).decode("utf-8-sig", errors="replace")
     except OSError as error:
         raise BenchError(f"{path}: the EDS cannot be read: {error.strerror}") from None
+    if max(map(len, text.splitlines()), default=0) > LONGEST_LINE:
+        raise BenchError(f"{path}: not a valid EDS: a line has more than {LONGEST_LINE} characters")
+    return text

@@ -45,8 +45,8 @@ def to_json(outcomes: Sequence[Outcome], facts: Mapping[str, str]) -> dict[str, 
 
 
 def print_outcome(console: Console, outcome: Outcome, *, verbose: bool) -> None:
-    """Print a line for a case; for passed cases and those not run only if `verbose`."""
-    if outcome.status in SHOWN_IF_VERBOSE and not verbose:
+    """Print a line for a case; for passed cases, those not run, and what no case judges only if `verbose`."""
+    if not verbose and (outcome.status in SHOWN_IF_VERBOSE or _is_unjudged(outcome)):
         return
     mark, style = STYLES[outcome.status]
     line = Text(f"{mark} ", style=style)
@@ -79,6 +79,17 @@ def print_summary(console: Console, outcomes: Sequence[Outcome]) -> None:
     counts = ", ".join(f"{count(outcomes, status)} {status}" for status in STYLES)
     style = "bold red" if count(outcomes, FAILED) else "bold green"
     console.print(Text(f"{len(outcomes)} cases: {counts}", style=style))
+    unjudged = sum(map(_is_unjudged, outcomes))
+    if unjudged:
+        what = "cases unjudged.* list" if unjudged > 1 else "case unjudged.* lists"
+        console.print(
+            f"{unjudged} {what} values of which only the limits are checked: --verbose shows them",
+            style="dim",
+        )
+
+
+def _is_unjudged(outcome: Outcome) -> bool:
+    return outcome.status == SKIPPED and outcome.area.endswith(".unjudged")
 
 
 def write_junit_report(path: Path, outcomes: Sequence[Outcome]) -> None:

@@ -479,7 +479,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
     cut_windows(counts, windows, *scene.level, scene.saturation, pixels)
     first = np.empty(count + 1, dtype=np.int32)
     neighbours = np.empty(_MAX_NEIGHBOURS * count, dtype=np.int32)
-    find_neighbours(windows, np.argsort(windows["start_y"]), first, neighbours)
+    find_neighbours(windows, np.argsort(windows["start_y"], kind="stable"), first, neighbours)
     ratio = _RELAXED_SHARE * settings.threshold_sigma
     stars = np.zeros(count, FIT)
     stars["state"] = NO_FIT

@@ -16,6 +16,7 @@ MARK_BGR: Final = (70, 190, 105)
 MISS_BGR: Final = (70, 90, 240)
 _TEXT_BGR: Final = (235, 215, 160)
 _SHADOW_BGR: Final = (20, 16, 12)
+_FRAME_BGR: Final = (110, 110, 110)
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _SUB_PIXEL_BITS: Final = 4
 _DARK: Final = 0.06
@@ -107,25 +108,29 @@ def _write(canvas: npt.NDArray[np.uint8], text: str, at: tuple[int, int], size: 
 
 
 def _draw_legend(canvas: npt.NDArray[np.uint8], size: float, taken: list[tuple[int, int, int, int]]) -> None:
-    """Explain the colours of the circles in the corner that is free, or else in that at the bottom left."""
+    """Explain the colours of the circles at the edge where that covers the fewest, as near to a corner as possible."""
     texts = [cv2.getTextSize(text, _FONT, size, 1)[0] for _, text in _LEGEND]
     line = round(max(2.0 * RADIUS_PX, *(height for _, height in texts)) + 6.0)
-    indent = round(2.0 * RADIUS_PX) + 8
-    width, height = indent + max(width for width, _ in texts), line * len(_LEGEND)
-    right, bottom = canvas.shape[1] - width - 6, canvas.shape[0] - height - 6
-    if right < 6 or bottom < 6:
+    indent = round(2.0 * RADIUS_PX) + 12
+    width, height = indent + max(width for width, _ in texts) + 6, line * len(_LEGEND) + 4
+    right, bottom = canvas.shape[1] - width - 1, canvas.shape[0] - height - 1
+    if right < 0 or bottom < 0:
         return
-    boxes = [
-        (left, top, left + width, top + height)
-        for left, top in ((6, bottom), (right, bottom), (6, 6), (right, 6))
-    ]
-    left, top, *_ = box = next(
-        (box for box in boxes if not any(_overlap(box, other) for other in taken)), boxes[0]
-    )
-    taken.append(box)
+
+    def badness(at: tuple[int, int]) -> tuple[int, int]:
+        box = (at[0], at[1], at[0] + width, at[1] + height)
+        covered = sum(_overlap(box, other) for other in taken)
+        return covered, min(at[0], right - at[0]) + min(at[1], bottom - at[1])
+
+    across, down = ([*range(0, end, 8), end] for end in (right, bottom))
+    places = [*((x, y) for x in across for y in (bottom, 0)), *((x, y) for y in down for x in (0, right))]
+    left, top = min(places, key=badness)
+    taken.append((left, top, left + width, top + height))
+    cv2.rectangle(canvas, (left, top), (left + width, top + height), _SHADOW_BGR, cv2.FILLED)
+    cv2.rectangle(canvas, (left, top), (left + width, top + height), _FRAME_BGR, 1)
     for row, ((colour, text), (_, text_height)) in enumerate(zip(_LEGEND, texts, strict=True)):
-        middle = top + line * row + line // 2
-        _circle(canvas, left + RADIUS_PX, middle, RADIUS_PX, colour)
+        middle = top + 2 + line * row + line // 2
+        _circle(canvas, left + 6 + RADIUS_PX, middle, RADIUS_PX, colour)
         _write(canvas, text, (left + indent, middle + text_height // 2), size)
 
 

@@ -27,7 +27,7 @@ _OPEN: Final = sum(getattr(os, name, 0) for name in ("O_RDONLY", "O_NONBLOCK", "
 STDOUT: Final = 1
 """File descriptor of standard output."""
 
-_NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NUMBER: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 TEXT_LIMIT: Final = 10 * MEGABYTE
 """Largest configuration file that is read, bytes."""

@@ -163,7 +163,8 @@ class TruthImager:
             return FrameResult(request.index, solved=False)
         return FrameResult(
             request.index, valid=True, reason="ok", tracked=request.predicted is not None,
-            quaternion_xyzw=as_quaternion(request.truth.attitude), sigma_cross_arcsec=1.5, sigma_roll_arcsec=6.0, detected=40,
+            quaternion_xyzw=as_quaternion(request.truth.attitude), sigma_cross_arcsec=1.5, sigma_roll_arcsec=6.0,
+            covariance_rad2=((5.3e-11, 0.0, 0.0), (0.0, 5.3e-11, 0.0), (0.0, 0.0, 8.5e-10)), detected=40,
             refused=3, matched=35, stars=STARS, probability_false=1e-12, rms_px=0.1, background_dn=8.2, noise_dn=0.61,
         )  # fmt: skip
 

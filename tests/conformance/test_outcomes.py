@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from functools import partial
 
 import pytest
 from rich.console import Console
@@ -166,6 +167,28 @@ def test_a_line_for_each_case_says_what_was_expected_and_seen(verbose, marks):
     assert "    expected an answer" in lines
     assert any(line.startswith("    seen     no") and "\x1b" not in line for line in lines)
     assert any(line.endswith("title of serial.modes.set [a clause]  no such row") for line in lines)
+
+
+def test_what_no_case_judges_is_one_line_of_the_summary_unless_asked_for():
+    unjudged = [
+        replace(
+            OUTCOMES[-2], id=f"can.unjudged.{kind}", area="can.unjudged", status="skipped", seen="of 3 fields"
+        )
+        for kind in ("stars", "frame")
+    ]
+    short, long = (
+        printed(
+            partial(
+                lambda console, verbose: [print_outcome(console, item, verbose=verbose) for item in unjudged],
+                verbose=verbose,
+            )
+        )
+        for verbose in (False, True)
+    )
+    assert short == []
+    assert [line.split()[1] for line in long] == ["can.unjudged.stars", "can.unjudged.frame"]
+    *_, last = printed(lambda console: print_summary(console, [*OUTCOMES, *unjudged]))
+    assert last == "2 cases unjudged.* list values of which only the limits are checked: --verbose shows them"
 
 
 def test_the_summary_counts_by_area():

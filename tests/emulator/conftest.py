@@ -54,6 +54,9 @@ STARS = (
     star(21421, 793.0, 65.7, 0.87, 500.0),
 )
 
+COVARIANCE = ((5.3e-11, 0.0, 0.0), (0.0, 5.3e-11, 0.0), (0.0, 0.0, 8.5e-10))
+"""Of 1.5″ across the boresight and 6″ about it, rad²."""
+
 PREVIEW = Preview(b"jpeg of a frame", b'{"width": 937, "height": 937, "hips": [32349]}')
 
 
@@ -97,6 +100,7 @@ class FakePipeline:
             quaternion_xyzw=(x, y, z, w),
             sigma_cross_arcsec=1.5,
             sigma_roll_arcsec=6.0,
+            covariance_rad2=COVARIANCE,
             detected=40,
             refused=3,
             matched=35,

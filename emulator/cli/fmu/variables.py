@@ -67,7 +67,7 @@ def variables(profile: str = "", orbit: str = "", command: str = "") -> list[Var
         Variable("stars_matched", 0, "Stars identified", "output"),
         Variable("exposure_unix_s", 0.0, "Middle of the exposure, by the device's clock", "output", "s", "time_of_exposure_s"),
         Variable("exposure_s", 0.0, "Middle of the exposure, by the time of the simulation", "output", "s", "run_time_s"),
-        Variable("sigma_cross", 0.0, "Standard deviation about x and about y", "output", "arcsec", "sigma_cross_arcsec"),
+        Variable("sigma_cross", 0.0, "Standard deviation about x or y, the larger", "output", "arcsec", "sigma_cross_arcsec"),
         Variable("sigma_roll", 0.0, "Standard deviation about the boresight", "output", "arcsec", "sigma_roll_arcsec"),
         Variable("seed", 1, "Random seed", "parameter"),
         Variable("check_rates", start=True, about="Whether the rates are connected; they then check the convention", causality="parameter"),

@@ -146,6 +146,11 @@ class ErrorModel:
             quaternion_xyzw=turned(as_quaternion(request.truth.attitude), error),
             sigma_cross_arcsec=cross_rad / ARCSEC,
             sigma_roll_arcsec=roll_rad / ARCSEC,
+            covariance_rad2=(
+                (square(cross_rad), 0.0, 0.0),
+                (0.0, square(cross_rad), 0.0),
+                (0.0, 0.0, square(roll_rad)),
+            ),
             detected=detected,
             matched=matched,
             stars=self._stars(request, random_of_frame),

@@ -16,6 +16,7 @@ from starid.identification.solution import FeatureReport
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
 Triple: TypeAlias = tuple[float, float, float]
+Matrix: TypeAlias = tuple[Triple, Triple, Triple]
 
 ZERO: Final[Triple] = (0.0, 0.0, 0.0)
 IDENTITY: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
@@ -31,6 +32,12 @@ def as_triple(vector: Array) -> Triple:
     """Return a vector (3,) as Python floats."""
     x, y, z = vector.tolist()
     return (x, y, z)
+
+
+def as_rows(matrix: Array) -> Matrix:
+    """Return a matrix (3, 3) as Python floats."""
+    first, second, third = matrix
+    return (as_triple(first), as_triple(second), as_triple(third))
 
 
 LENGTH: Final = struct.Struct("<I")
@@ -235,7 +242,9 @@ class FrameResult:
     """Attitude ICRS→sensor at mid-exposure; zeros if invalid."""
     sigma_cross_arcsec: float = 0.0
     sigma_roll_arcsec: float = 0.0
-    """Standard deviation about an axis across the boresight, and about the boresight."""
+    """Standard deviation about the axis across the boresight about which it is largest, and about the boresight."""
+    covariance_rad2: Matrix | None = None
+    """Covariance of the rotation vector of the error, sensor frame; None if invalid."""
     rate_rad_s: Triple | None = None
     """Body rate, if the algorithm estimates one."""
     detected: int = 0

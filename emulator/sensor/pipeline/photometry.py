@@ -105,7 +105,7 @@ def _limit_of(magnitude: Array, error: Array) -> MeasuredPhotometry:
     faintest = float(np.quantile(magnitude, _RENDERED_SHARE))
     limit = min(centre - _ODDS / slope, faintest) if slope > 0.0 else faintest
     above = np.flatnonzero(found & (magnitude <= limit))
-    last = error[above[np.argsort(magnitude[above])][-_LAST:]]
+    last = error[above[np.argsort(magnitude[above], kind="stable")][-_LAST:]]
     sigma = float(_MAD_TO_SIGMA * np.median(np.abs(last - np.median(last)))) if last.size else _UNKNOWN_SIGMA
     return MeasuredPhotometry(limit, sigma)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import itertools
+import math
 import subprocess
 import time
 from dataclasses import dataclass, field, replace
@@ -36,6 +37,7 @@ from starhil.emulator.sensor.pipeline.messages import (
     PipelineSetup,
     Preview,
     SolverSettings,
+    as_rows,
     as_triple,
     camera_constants,
 )
@@ -48,9 +50,9 @@ from starhil.emulator.sensor.sky.objects import SkyObjects
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.arithmetic.arrays import Array, Mask
-from starid.arithmetic.elementary import log10
+from starid.arithmetic.elementary import hypot, log10
 from starid.arithmetic.matrices import length, lengths
-from starid.attitude import Attitude
+from starid.attitude import ARCSEC_PER_RAD, Attitude
 from starid.camera import Camera
 from starid.camera.position_errors import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
@@ -533,8 +535,9 @@ class Pipeline:
             reason=reason,
             tracked=solution.mode == "tracking",
             quaternion_xyzw=(x, y, z, w),
-            sigma_cross_arcsec=solution.cross_boresight_sigma_arcsec if valid else 0.0,
+            sigma_cross_arcsec=_largest_across_rad(solution.covariance) * ARCSEC_PER_RAD if valid else 0.0,
             sigma_roll_arcsec=solution.roll_sigma_arcsec if valid else 0.0,
+            covariance_rad2=as_rows(solution.covariance) if valid else None,
             rate_rad_s=None if rate is None else (float(rate[0]), float(rate[1]), float(rate[2])),
             detected=len(detections.flux),
             refused=detections.rejected,
@@ -558,6 +561,12 @@ class Pipeline:
             height, width = image.shape
             return ImageResult(width, height, frame, eight_bits(image, bits).tobytes())
         return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
+
+
+def _largest_across_rad(covariance: Array) -> float:
+    """Return the largest standard deviation about an axis across the boresight, from the covariance (3, 3) of a rotation vector."""
+    (xx, xy), (_, yy) = covariance[:2, :2].tolist()
+    return math.sqrt(0.5 * (xx + yy) + hypot(0.5 * (xx - yy), xy))
 
 
 def _offsets(identifier: StarIdentifier, solution: Solution, xy: Array, request: FrameRequest) -> Array:

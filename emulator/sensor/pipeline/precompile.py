@@ -8,6 +8,7 @@ need.
 from __future__ import annotations
 
 import gc
+import os
 import subprocess
 import sys
 
@@ -19,14 +20,15 @@ def start_helper() -> subprocess.Popen[bytes] | None:
     """Start the process that compiles the star identifier, unless the cache has kernels; the caller must wait for it."""
     if not nothing_compiled():
         return None
-    return subprocess.Popen(
-        [sys.executable, "-P", "-m", "starhil.emulator.sensor.pipeline.precompile"], stdin=subprocess.DEVNULL
+    module = "starhil.emulator.sensor.pipeline.precompile"
+    return subprocess.Popen(  # noqa: S603
+        [sys.executable, "-P", "-m", module, str(os.getpid())], stdin=subprocess.DEVNULL
     )
 
 
 def main() -> None:
     """Compile kernels into the cache."""
-    end_with_parent()
+    end_with_parent(int(sys.argv[1]))
     gc.disable()  # compiling makes many objects and little garbage: collecting it takes an eighth of the time
     from starid.identification.geometric.identifier import Identifier
     from starid.imaging import pairs

@@ -1,37 +1,62 @@
 """How far an attitude from features alone is off, measured on simulated fields of the same camera and database.
 
 The answer of algorithm 1 is either right to a fraction of a cell, or somewhere else in the sky: a star on the wrong side
-of the brightness limit changes all five features. The smaller ε_ψ is, the rarer is the second. The covariance of an
-answer is the mean of both, weighted with the probability of the second.
+of the brightness limit changes all five features. The smaller ε_ψ is, the rarer is the second. The mean square that is stated
+is that of both.
+
+The images of a sequence show the same stars, so their answers are not independent. That a region of search keeps fitting says
+little new about its place, and its centre, which is the last answer, may drift away. Where a region stops fitting, the features are
+bad, and an answer that is not at the place of the last one is worse than one to a first image with the same ε_ψ. So sequences of
+images are simulated, and each kind of answer has the errors that it had there.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from starid.arithmetic.arrays import Array, elementwise
-from starid.arithmetic.elementary import exp, hypot, log, square
+from starid.arithmetic.arrays import Array, Indices, elementwise
+from starid.arithmetic.elementary import exp, log, square
+from starid.arithmetic.matrices import length, lengths
 from starid.attitude import Attitude, random_attitude
 from starid.catalog.photometry import flux_ratio
-from starid.identification.thesis.feature_search import FeatureSearch
+from starid.identification.thesis.feature_search import FeatureAnswer, FeatureSearch
 from starid.identification.thesis.features import FeatureVector
 
 FIELDS: Final = 800
-"""Number of simulated fields."""
+"""Number of simulated sequences."""
+
+IMAGES: Final = 6
+"""Number of images of each."""
+
+MOTIONS: Final = (0.0, 0.007, 0.05)
+"""Motion from image to image in the simulated sequences, as a share of the width of the field: at rest, 0.3° and 2° of 42°."""
 
 RIGHT_DEG: Final = 1.5
 """Error of the boresight up to which an answer is at the right place of the sky, degrees."""
 
+FAR_DEG: Final = 10.0
+"""Error beyond which it is any: those between are of a region that has drifted, or of a neighbouring place."""
+
+_MOTION_LIMITS: Final = (0.0024, 0.019)
+"""Between the `MOTIONS`."""
+
 _SEED: Final = 20_221_017
 _CLASSES: Final = 8
+_ROW: Final = 3
+"""Number of classes of answers at the same place, by how many there were in a row; the last has all longer rows."""
+_FEW: Final = 8
+"""Number of answers of a class from which its mean square is taken; with fewer, it is that of all classes."""
 _SLOPE_MAG: Final = 0.2
 """Width of the magnitudes over which the share of stars found falls from 90 to 50 %."""
-_FLOOR_MAG: Final = 0.03
-"""Error of a bright star's magnitude: blends, variability and the catalogue."""
+_BLENDED: Final = 0.04
+_BLEND_MAG: Final = 0.1
+"""Share of the stars whose magnitudes are off by this, the same in all images: blends, variable stars and the catalogue. On images
+of `ideal` and `thesis`, 95 % of the stars near κ are within 0.02 mag, and the others are off by 0.1 mag."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,15 +68,15 @@ class Photometry:
     limit
         Magnitude at which 90 % of the stars are found.
     sigma
-        One-sigma error of a magnitude there; that of a brighter star is smaller in proportion to its flux.
+        One-sigma error of a magnitude there; that of a brighter star is smaller as the root of its flux, by photon noise.
     """
 
     limit: float
     sigma: float
 
     def measured(self, rng: np.random.Generator, magnitude: Array) -> Array:
-        """Magnitudes as measured, infinite for stars that are not found."""
-        sigma = np.sqrt(square(_FLOOR_MAG) + square(self.sigma * flux_ratio(self.limit - magnitude)))
+        """Magnitudes as measured in one image, infinite for stars that are not found."""
+        sigma = self.sigma * np.sqrt(flux_ratio(self.limit - magnitude))
         slope = log(9.0) / _SLOPE_MAG
         found = 1.0 / (1.0 + elementwise(exp, slope * (magnitude - self.limit - _SLOPE_MAG)))
         seen = rng.uniform(size=magnitude.size) < found
@@ -60,93 +85,196 @@ class Photometry:
         )
 
 
+class StatedError(NamedTuple):
+    """Covariance (3, 3) of the rotation vector in the sensor frame, rad², and the probability of another place of the sky."""
+
+    covariance: Array
+    wrong: float
+
+
+RANDOM: Final = StatedError(np.eye(3) * (square(math.pi) / 3.0 + 2.0) / 3.0, 1.0)
+"""Error of an attitude that is a random one: the rotation angle θ between two has the density (1 − cos θ)/π."""
+
+
+@dataclass(frozen=True, eq=False)
+class ErrorTable:
+    """Errors of one kind of answer, in k classes.
+
+    Attributes
+    ----------
+    squares
+        Mean square rotation about an axis across the boresight, and about the boresight, rad², (k, 2).
+    wrong
+        Share of answers at another place of the sky, (k,).
+    """
+
+    squares: Array
+    wrong: Array
+
+    def stated(self, row: int) -> StatedError:
+        """What is stated of an answer in a class."""
+        across, about = self.squares[row]
+        return StatedError(np.diag([across, across, about]), float(self.wrong[row]))
+
+    @classmethod
+    def of(cls, rows: Indices, errors: Array, classes: int, far: Array) -> Self:
+        """The table of answers with classes (n,) and rotation vectors (n, 3), rad.
+
+        The mean squares `far` (2,) of all that are far off stand for the few of one class.
+        """
+        off = off_deg(errors)
+        squares, near = np.empty((classes, 2)), off <= FAR_DEG
+        count = np.bincount(rows, minlength=classes)
+        share = (np.bincount(rows[~near], minlength=classes) + 0.5) / (count + 1.0)
+        for row in range(classes):
+            chosen = near & (rows == row)
+            others = errors[chosen if np.count_nonzero(chosen) >= _FEW else near]
+            squares[row] = share[row] * far + (1.0 - share[row]) * (
+                mean_squares(others) if len(others) else far
+            )
+        wrong = (np.bincount(rows[off > RIGHT_DEG], minlength=classes) + 0.5) / (count + 1.0)
+        return cls(squares, wrong)
+
+
 @dataclass(frozen=True, eq=False)
 class FeatureErrors:
-    """Errors of an attitude from features, by classes of ε_ψ.
+    """Errors of an attitude from features.
 
     Attributes
     ----------
     upper
         Largest ε_ψ of each class, (k,).
-    wrong
-        Share of answers from the whole database at another place of the sky, (k,).
-    right
-        Mean square rotation of the others about an axis across the boresight, and about the boresight, rad², (k, 2).
-    gross
-        The same for those at another place, (2,).
-    ratio
-        How much more often the region around an answer at another place has such an ε_ψ, after a motion by about a cell,
-        than the region around an answer at the right place, (k,).
+    first, elsewhere
+        Errors of answers by classes of ε_ψ: to the first image of a sequence, and after a region that did not fit, away from the
+        place of the last answer.
+    region, again
+        Errors of answers by the number of images in a row that were at the same place, one table for each of `MOTIONS`: from a
+        region that fits, and after one that did not, at the place of the last answer nevertheless.
     """
 
     upper: Array
-    wrong: Array
-    right: Array
-    gross: Array
-    ratio: Array
+    first: ErrorTable
+    elsewhere: ErrorTable
+    region: tuple[ErrorTable, ...]
+    again: tuple[ErrorTable, ...]
 
-    def row(self, error_psi: float) -> int:
-        """The class of an ε_ψ."""
-        return min(int(np.searchsorted(self.upper, error_psi)), self.upper.size - 1)
+    def of_first(self, error_psi: float) -> StatedError:
+        """Error of an answer to the first image."""
+        return self.first.stated(int(_rows(self.upper, error_psi)))
 
-    def covariance(self, error_psi: float, wrong: float) -> Array:
-        """Covariance of the rotation vector in the sensor frame, rad², (3, 3); `wrong` is the probability of another place."""
-        across, about = (1.0 - wrong) * self.right[self.row(error_psi)] + wrong * self.gross
-        return np.diag([across, across, about])
+    def of_elsewhere(self, error_psi: float) -> StatedError:
+        """Error of an answer away from the last one."""
+        return self.elsewhere.stated(int(_rows(self.upper, error_psi)))
+
+    def at_place(self, images: int, moved: float, *, fits: bool) -> StatedError:
+        """Error of the nth answer in a row at the same place, after a motion as a share of the field."""
+        tables = self.region if fits else self.again
+        return tables[int(np.searchsorted(_MOTION_LIMITS, moved))].stated(min(images, _ROW) - 1)
 
     @classmethod
-    def of_search(cls, search: FeatureSearch, photometry: Photometry, side_deg: float) -> Self:
-        """Measure the errors on simulated fields, in the whole database and in regions of a side in degrees."""
+    def of_search(
+        cls, search: FeatureSearch, photometry: Photometry, side_deg: float, threshold: float, largest: float
+    ) -> Self:
+        """Measure the errors on simulated sequences.
+
+        `side_deg` is the side of a region, `threshold` the largest ε_ψ with which it fits, and `largest` that of an attitude.
+        """
         rng = np.random.default_rng(_SEED)
-        psi, errors = [], []
-        here: list[float] = []
-        elsewhere: list[float] = []
-        for _ in range(FIELDS):
-            somewhere = random_attitude(rng)
+        first, elsewhere = _Answers(), _Answers()
+        region, again = [_Answers() for _ in MOTIONS], [_Answers() for _ in MOTIONS]
+        stars = int(search.stars.source.max()) + 1
+        for number in range(FIELDS):
+            somewhere, axis = random_attitude(rng), rng.normal(size=3)
             truth = Attitude.from_radec_roll(somewhere.ra_deg, somewhere.dec_deg, 0.0)
-            features = _features_at(search, photometry, rng, truth)
-            if features is None:
-                continue
-            answer = search.answer(features)
-            psi.append(answer.error_psi)
-            errors.append(answer.attitude.error_to(truth).rotation_vector_rad)
-            step = search.database.grid.step_deg * rng.normal(size=2)
-            move = (*np.radians(step), 0.0)
-            later = _features_at(search, photometry, rng, truth.rotated(move))
-            local = (
-                None
-                if later is None
-                else search.answer_in_region(later, answer.attitude.rotated(move), side_deg)
-            )
-            if local is not None:
-                errors_psi = elsewhere if hypot(*errors[-1][:2]) > math.radians(RIGHT_DEG) else here
-                errors_psi.append(local.error_psi)
-        squares = square(np.array(errors))
-        upper = np.quantile(psi, np.arange(1, _CLASSES + 1) / _CLASSES)
+            which = number % len(MOTIONS)
+            move = math.radians(MOTIONS[which] * search.database.parameters.fov_deg) * axis / length(axis)
+            own = np.where(rng.uniform(size=stars) < _BLENDED, _BLEND_MAG * rng.normal(size=stars), 0.0)
+            centre: Attitude | None = None
+            held, exceeded = 0, False
+            for _ in range(IMAGES):
+                features = _features_at(search, photometry, rng, own, truth)
+                if features is None:
+                    break
+                local = (
+                    None
+                    if centre is None or exceeded
+                    else search.answer_in_region(features, centre, side_deg)
+                )
+                if local is not None and local.error_psi <= threshold:
+                    held += 1
+                    answer = local
+                    region[which].add(min(held, _ROW) - 1, answer, truth)
+                else:
+                    answer = search.answer(features)
+                    if local is not None and local.error_psi < answer.error_psi:
+                        answer = local
+                    held = held + 1 if is_near(answer.attitude, centre) else 0
+                    if held:
+                        again[which].add(min(held, _ROW) - 1, answer, truth)
+                    else:
+                        (first if centre is None else elsewhere).add(answer.error_psi, answer, truth)
+                if answer.error_psi > largest:
+                    break
+                exceeded = answer.error_psi > threshold
+                truth, centre = truth.rotated(move), answer.attitude.rotated(move)
+        upper = np.quantile(first.values, np.arange(1, _CLASSES + 1) / _CLASSES)
         upper[-1] = math.inf
-        rows = np.searchsorted(upper, psi)
-        lost = np.sqrt(squares[:, 0] + squares[:, 1]) > math.radians(RIGHT_DEG)
-        right = np.array([_mean_squares(squares[(rows == row) & ~lost]) for row in range(_CLASSES)])
-        count = np.bincount(rows, minlength=_CLASSES)
-        wrong = (np.bincount(rows[lost], minlength=_CLASSES) + 0.5) / (count + 1.0)
-        likely, unlikely = (
-            (np.bincount(np.searchsorted(upper, errors_psi), minlength=_CLASSES) + 0.5)
-            / (len(errors_psi) + 0.5 * _CLASSES)
-            for errors_psi in (here, elsewhere)
-        )
-        return cls(upper, wrong, right, _mean_squares(squares[lost]), unlikely / likely)
+        every = np.concatenate([kind.vectors for kind in (first, elsewhere, *region, *again)])
+        off = every[off_deg(every) > FAR_DEG]
+        far = mean_squares(off) if len(off) else np.diag(RANDOM.covariance)[:2]
+
+        def by_error(kind: _Answers) -> ErrorTable:
+            return ErrorTable.of(_rows(upper, kind.values), kind.vectors, _CLASSES, far)
+
+        def by_row(kinds: list[_Answers]) -> tuple[ErrorTable, ...]:
+            rows = [(np.array(kind.values, dtype=np.int64), kind.vectors) for kind in kinds]
+            return tuple(ErrorTable.of(*each, _ROW, far) for each in rows)
+
+        return cls(upper, by_error(first), by_error(elsewhere), by_row(region), by_row(again))
+
+
+class _Answers:
+    """Answers of one kind: ε_ψ or class, and error as a rotation vector, rad."""
+
+    def __init__(self) -> None:
+        self.values: list[float] = []
+        self._errors: list[Array] = []
+
+    def add(self, value: float, answer: FeatureAnswer, truth: Attitude) -> None:
+        self.values.append(value)
+        self._errors.append(answer.attitude.error_to(truth).rotation_vector_rad)
+
+    @property
+    def vectors(self) -> Array:
+        """The errors, (n, 3)."""
+        return np.array(self._errors).reshape(-1, 3)
+
+
+def off_deg(errors: Array) -> Array:
+    """Angles between boresights, (n,), of rotation vectors (n, 3), rad."""
+    return np.degrees(lengths(errors[:, :2]))
+
+
+def mean_squares(errors: Array) -> Array:
+    """Mean squares (2,) of rotation vectors (n, 3) about an axis across the boresight, and about the boresight."""
+    return np.array([square(errors[:, :2]).mean(), square(errors[:, 2]).mean()])
+
+
+def is_near(answer: Attitude, centre: Attitude | None) -> bool:
+    """Whether an answer is at the place of the last one, as far as features determine it; without one, it is not."""
+    if centre is None:
+        return False
+    return bool(off_deg(answer.error_to(centre).rotation_vector_rad[None])[0] <= RIGHT_DEG)
+
+
+def _rows(upper: Array, error_psi: ArrayLike) -> Indices:
+    """Classes of ε_ψ."""
+    return np.asarray(np.minimum(np.searchsorted(upper, error_psi), upper.size - 1))
 
 
 def _features_at(
-    search: FeatureSearch, photometry: Photometry, rng: np.random.Generator, attitude: Attitude
+    search: FeatureSearch, photometry: Photometry, rng: np.random.Generator, own: Array, attitude: Attitude
 ) -> FeatureVector | None:
-    """Features of the field at an attitude as the detector sees it; None with too few stars."""
-    brightness, offsets, _ = search.stars.stars_in_frame(attitude.ra_deg, attitude.dec_deg)
-    return search.features(search.field_of(offsets, photometry.measured(rng, brightness)))
-
-
-def _mean_squares(squares: Array) -> Array:
-    """Mean of squared rotations (n, 3) across and about the boresight, (2,); that of a degree if there are none."""
-    if len(squares) == 0:
-        return np.full(2, square(math.radians(RIGHT_DEG)))
-    return np.array([squares[:, :2].mean(), squares[:, 2].mean()])
+    """Features of the field at an attitude as the detector sees it, with errors of the stars' own; None with too few stars."""
+    brightness, offsets, source = search.stars.stars_in_frame(attitude.ra_deg, attitude.dec_deg)
+    return search.features(search.field_of(offsets, photometry.measured(rng, brightness + own[source])))

@@ -163,6 +163,10 @@ class FeatureSearch:
         """Number of stars of the field within the brightness limit of the features."""
         return int(np.searchsorted(field.magnitude, self.database.parameters.kappa, side="right"))
 
+    def reaches_limit(self, field: FieldStars) -> bool:
+        """Whether stars as faint as the brightness limit are seen; the faintest detection may be a false star."""
+        return field.magnitude.size > 1 and bool(field.magnitude[-2] > self.database.parameters.kappa)
+
     def features(self, field: FieldStars) -> FeatureVector | None:
         """Feature vector of the stars within the brightness limit; None if there are too few."""
         count = self.bright(field)

@@ -36,7 +36,7 @@ from starid.identification.single_camera import CheckedDetections
 from starid.identification.solution import FeatureReport, Reason, Search, Solution
 from starid.identification.thesis.database import DatabaseParameters, sky_of
 from starid.identification.thesis.database_choice import given_database, obtain_database
-from starid.identification.thesis.feature_error import FeatureErrors, Photometry
+from starid.identification.thesis.feature_error import RANDOM, FeatureErrors, Photometry, StatedError
 from starid.identification.thesis.feature_search import (
     ESTIMATE_SHARE,
     MIN_STARS,
@@ -170,7 +170,10 @@ class LsiIdentifier(VerifiedIdentifier):
         photometry = Photometry(
             self.database.parameters.kappa + 1.0 if limit is None else limit, self.options.magnitude_sigma
         )
-        return FeatureErrors.of_search(self.search, photometry, REGION_DEG)
+        options = self.options
+        return FeatureErrors.of_search(
+            self.search, photometry, REGION_DEG, options.threshold, options.largest_error_psi
+        )
 
     def _sensor_stars(self, limit: float) -> StarCatalog:
         """Stars to a magnitude as the sensor sees them: unresolved ones merged, with its own magnitudes as `v`."""
@@ -304,31 +307,36 @@ class LsiIdentifier(VerifiedIdentifier):
             answers = (*first, self.search.answer(features))
             best = min(answers, key=lambda answer: answer.error_psi)
             self.last_report = LsiReport(answers[-1].attitude, 0, 0, zero_point)
-            return self.by_features_alone(best, "lsi" if best is answers[-1] else "rsi")
+            return self.by_features_alone(best, "lsi" if best is answers[-1] else "rsi", measured)
         self.last_report = LsiReport(None, 0, 0, math.nan)
         return Solution.invalid(Reason.TOO_FEW_STARS)
 
     def by_features_alone(
-        self, answer: FeatureAnswer, search: Search, wrong: float | None = None
+        self, answer: FeatureAnswer, search: Search, measured: CheckedDetections
     ) -> Solution:
         """The solution of the first stage; invalid if ε_ψ > K·τ.
 
-        `search` says where the answer was found. `wrong` is the probability that it is at another place of the sky; by
-        default that of the whole database.
+        `search` says where the answer was found. Its error is that of an answer of the whole database to a first image.
         """
         report = report_of(answer, search)
-        psi = answer.error_psi
-        if self.errors is None or psi > self.options.largest_error_psi:
+        if self.errors is None or answer.error_psi > self.options.largest_error_psi:
             return dataclasses.replace(Solution.invalid(Reason.RESIDUAL), features=report)
-        likely = float(self.errors.wrong[self.errors.row(psi)]) if wrong is None else wrong
-        return Solution(
+        found = Solution(
             valid=True,
             reason=Reason.OK,
             quaternion_xyzw=answer.attitude.quaternion_xyzw,
-            covariance=self.errors.covariance(psi, likely),
-            probability_false=likely,
             features=report,
         )
+        return self.with_error(found, measured, self.errors.of_first(answer.error_psi))
+
+    def with_error(self, solution: Solution, measured: CheckedDetections, stated: StatedError) -> Solution:
+        """A solution with its error; that of a random attitude if the image does not show stars down to the brightness limit."""
+        zero_point = self.zero_point
+        if zero_point is not None and not self.search.reaches_limit(
+            self._fields(measured, self.search, zero_point, None)
+        ):
+            stated = RANDOM
+        return dataclasses.replace(solution, covariance=stated.covariance, probability_false=stated.wrong)
 
     def _first_verified(
         self,

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arithmetic.arrays import Array, Mask, elementwise
-from starid.arithmetic.elementary import atan2, hypot, log10, power
+from starid.arithmetic.elementary import atan2, hypot, log10
 from starid.arithmetic.matrices import lengths, product
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
@@ -27,6 +27,7 @@ from starid.identification.single_camera import CheckedDetections, SingleCameraI
 from starid.identification.solution import FeatureReport, Solution
 from starid.identification.thesis.cme import matched_motion
 from starid.identification.thesis.false_stars import ObservedFrame
+from starid.identification.thesis.feature_error import is_near
 from starid.identification.thesis.feature_search import ESTIMATE_SHARE, FeatureAnswer, FieldStars
 from starid.identification.thesis.lsi_identifier import (
     WINDOW_PX,
@@ -40,7 +41,6 @@ from starid.identification.thesis.scalable_filter import MAX_OBJECTS, TrackFilte
 _MIN_MATCHES: Final = 3
 _ENOUGH_MATCHES: Final = 8
 """Number of matches that two images of different fields do not have by chance."""
-_LEAST_WRONG: Final = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +159,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         )
         self._before: ObservedFrame | None = None
         self._last: Attitude | None = None
-        self._wrong = 1.0
+        self._held = 0
         self._exceeded = False
         self.statistics = RsiStatistics()
 
@@ -180,7 +180,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         """Forget previous frames, the learned zero point and the statistics."""
         self.lsi.reset()
         self._before = self._last = None
-        self._wrong = 1.0
+        self._held = 0
         self._exceeded = False
         self.statistics = RsiStatistics()
 
@@ -188,6 +188,10 @@ class RsiIdentifier(SingleCameraIdentifier):
         """Find the attitude in the whole database, from the stars that the filter keeps."""
         prior = self.preprocess(measured.xy, measured.flux)
         solution = self._whole_sky(measured, prior)
+        if self._exceeded:
+            solution = self._after_failure(solution, measured, prior)
+        else:
+            self._held = 0
         self._remember(solution)
         return dataclasses.replace(solution, features=prior.add_to(solution.features))
 
@@ -209,21 +213,20 @@ class RsiIdentifier(SingleCameraIdentifier):
         missing image, is it the prediction given; the region is then at least as wide as the window.
         """
         prior = self.preprocess(measured.xy, measured.flux)
-        side = prior.side_deg
-        if self._last is not None and prior.rotation is not None:
-            centre = Attitude.from_matrix(product(prior.rotation, self._last.matrix))
-        else:
-            centre = predicted
-            if window_px is not None:
-                side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
+        side, carried = prior.side_deg, self._carried(prior)
+        centre = carried or predicted
+        if carried is None and window_px is not None:
+            side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
         side = min(side, self.lsi.database.parameters.fov_deg)
         if self._exceeded:
-            solution = self._whole_sky(measured, prior)
+            solution = self._after_failure(self._whole_sky(measured, prior), measured, prior)
             report = prior.add_to(solution.features)
         else:
             field, answers = self._in_region(measured, prior, centre, side)
             local = None if field is None else self._accepted(measured, prior, field, answers)
-            solution = self._whole_sky(measured, prior, answers[:1]) if local is None else local
+            solution = local or self._after_failure(
+                self._whole_sky(measured, prior, answers[:1]), measured, prior
+            )
             report = prior.add_to(
                 solution.features,
                 triggered=local is None,
@@ -236,24 +239,37 @@ class RsiIdentifier(SingleCameraIdentifier):
 
     def _remember(self, solution: Solution) -> None:
         self._last = solution.attitude if solution.valid else None
-        self._wrong = solution.probability_false
+        if not solution.valid:
+            self._held = 0
         features = solution.features
         self._exceeded = features is None or not (
             solution.valid and (features.refined or features.error_psi <= self._settings.tau)
         )
 
-    def _place_wrong(self, answer: FeatureAnswer, prior: Preprocessed) -> float:
-        """Probability that the region is at another place of the sky, by Bayes' rule from the last image's.
+    def _after_failure(
+        self, solution: Solution, measured: CheckedDetections, prior: Preprocessed
+    ) -> Solution:
+        """The same answer of features alone, with the error that it has after a region that did not fit."""
+        errors, features = self.lsi.errors, solution.features
+        if errors is None or not solution.valid or features is None:
+            return solution
+        if is_near(solution.attitude, self._carried(prior)):
+            self._held += 1
+            stated = errors.at_place(self._held, self._moved(prior), fits=False)
+        else:
+            self._held = 0
+            stated = errors.of_elsewhere(features.error_psi)
+        return self.lsi.with_error(solution, measured, stated)
 
-        The features say something new only as far as other stars are seen: in proportion to the motion, up to a cell.
-        """
-        errors = self.lsi.errors
-        if errors is None:
-            return self._wrong
-        new = min(prior.translation_deg / self.lsi.database.grid.step_deg, 1.0)
-        odds = self._wrong / max(1.0 - self._wrong, _LEAST_WRONG)
-        odds *= power(float(errors.ratio[errors.row(answer.error_psi)]), new)
-        return max(float(odds / (1.0 + odds)), _LEAST_WRONG)
+    def _moved(self, prior: Preprocessed) -> float:
+        """Motion since the last image as a share of the width of the field."""
+        return prior.translation_deg / self.lsi.database.parameters.fov_deg
+
+    def _carried(self, prior: Preprocessed) -> Attitude | None:
+        """The last attitude, carried by the measured motion; None if either is unknown."""
+        if self._last is None or prior.rotation is None:
+            return None
+        return Attitude.from_matrix(product(prior.rotation, self._last.matrix))
 
     def _count(self, solution: Solution, report: FeatureReport) -> None:
         old = self.statistics
@@ -339,7 +355,11 @@ class RsiIdentifier(SingleCameraIdentifier):
             if answer.error_psi > self._settings.tau:
                 continue
             if not self.options.refinement:
-                found = self.lsi.by_features_alone(answer, "rsi", self._place_wrong(answer, prior))
+                errors, found = self.lsi.errors, self.lsi.by_features_alone(answer, "rsi", measured)
+                if errors is not None:
+                    self._held += 1
+                    stated = errors.at_place(self._held, self._moved(prior), fits=True)
+                    found = self.lsi.with_error(found, measured, stated)
                 return dataclasses.replace(found, mode="tracking")
             for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
                 if attitude is None:

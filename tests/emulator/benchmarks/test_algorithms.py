@@ -31,3 +31,4 @@ def test_shares_are_of_all_images_and_one_sequence_has_no_standard_error(refined
         assert row["valid_pct"] == 100.0 * row["valid"] / IMAGES
         assert row["right_pct"] == 100.0 * (row["valid"] - row["wrong"]) / IMAGES
         assert row["valid_error_pct"] is None
+        assert row["normalised_squared_error_error"] is None

@@ -209,6 +209,27 @@ def test_everything_fits_the_width_and_text_is_at_least_12_px(page, width):
         assert page.evaluate("document.getElementById('tabs').getBoundingClientRect().bottom <= innerHeight")
 
 
+@pytest.mark.parametrize("width", [390, 1280])
+def test_no_name_and_unit_is_cut_off(page, width):
+    page.set_viewport_size({"width": width, "height": 844})
+    open_tab(page, "telemetry")
+    cut_off = page.evaluate(
+        """() => [...document.querySelectorAll("#top *, #telemetry b, #telemetry th, #telemetry .unit, .legend *")]
+            .filter((each) => each.checkVisibility() && !each.matches(".val") && each.scrollWidth > each.clientWidth + 1)
+            .filter((each) => getComputedStyle(each).display !== "inline").map((each) => each.textContent)"""
+    )
+    assert cut_off == []
+
+
+def test_a_telephone_shows_the_whole_image_below_the_header(page):
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.evaluate("scrollTo(0, 0)")
+    bottom, tabs = page.evaluate(
+        "['.stage', '#tabs'].map((each, i) => document.querySelector(each).getBoundingClientRect()[i ? 'top' : 'bottom'])"
+    )
+    assert bottom < tabs
+
+
 def test_text_follows_the_font_size_of_the_browser(page):
     before = page.evaluate("getComputedStyle(document.getElementById('ra')).fontSize")
     page.evaluate("document.documentElement.style.fontSize = '200%'")

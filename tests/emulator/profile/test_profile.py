@@ -111,6 +111,14 @@ def test_a_focal_length_in_millimetres_is_one_of_pixels(tmp_path):
     )
 
 
+@pytest.mark.parametrize("keys", ["focal_mm=16", "focal_px=[2000.0, 2000.0]"])
+def test_the_axis_of_a_camera_given_by_its_focal_length_is_in_the_centre(keys):
+    settings = [f"camera.{keys}", "camera.width=1024", "camera.height=700", "sensor.pixel_um=8"]
+    camera = Camera.from_dict(load_profile("ideal", settings).camera_values)
+    assert camera.centre_px == (511.5, 349.5)
+    assert camera.focal_px == (2000.0, 2000.0)
+
+
 def test_errors_of_the_calibration_belong_to_the_camera(tmp_path):
     cubestar = load_profile("cubestar").calibration
     covariance = np.array(cubestar.matrix())

@@ -21,6 +21,7 @@ from starhil.emulator.truth.orbit import (
     interpolate_orbit,
 )
 from starhil.emulator.truth.source import FixedTruth, TruthState
+from starid.arithmetic.matrices import length
 from starid.attitude import Attitude
 from starid.catalog.earth import unix_time
 
@@ -163,6 +164,18 @@ def test_a_tle_whose_columns_are_shifted_is_rejected_though_its_checksum_is_righ
     lines[changed] = summed(lines[changed].replace(old, new))
     with pytest.raises(EmulatorError, match=re.escape(said)):
         TleOrbit(*lines)
+
+
+def test_a_tle_that_leaves_the_earth_has_no_position():
+    """A drag term whose columns are shifted had the satellite beyond the stars the next day."""
+    first = "1 25544U 98067A   24001.50000000  .00016717     10270-3 0  9009     "
+    second = "2 25544  51.6400 208.9163 0006317  69.9862  25.2906 15.49560532    1"
+    orbit = TleOrbit(summed(first), summed(second))
+    start = unix_time("2024-01-01T12:00:00")
+    assert length(orbit.state(start).position_m) < 7e6
+    for days in (6, 7, 8, 30):
+        with pytest.raises(EmulatorError, match="TLE: has no position at the run's date"):
+            orbit.state(start + 86400.0 * days)
 
 
 def test_interpolated_states_lie_on_the_orbit():

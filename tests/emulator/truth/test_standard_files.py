@@ -10,6 +10,7 @@ import math
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
@@ -431,6 +432,7 @@ STK_HEAD = "stk.v.12.0\nBEGIN Attitude\n"
         ("CCSDS_OEM_VERS = 2.0\nMETA_START\n", "not a CCSDS AEM"),
         ("<html/>", "not a CCSDS AEM"),
         ("<aem", "not XML"),
+        ("<!DOCTYPE aem [<!ENTITY a 'b'>]><aem>&a;</aem>", "has a DOCTYPE, which no CCSDS message has; remove it"),
         (STK_HEAD + "CoordinateAxes Fixed\nScenarioEpoch 1 Jan 2026 0:00:00\nAttitudeTimeQuaternions\n0 0 0 0 1\n", "frame 'Fixed'"),
         (STK_HEAD + "ScenarioEpoch 1 Jan 2026 0:00:00\nAttitudeTimeYPRAngles\n", "format 'AttitudeTimeYPRAngles' is not read"),
         (STK_HEAD + "TimeFormat UTCG\nAttitudeTimeQuaternions\n", "needs a ScenarioEpoch and times in seconds"),
@@ -445,6 +447,17 @@ def test_a_file_that_cannot_be_obeyed_is_an_error_that_says_why(tmp_path: Path, 
         read_truth_file(write(tmp_path, text))
     assert said in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_declarations_in_xml_take_no_memory(tmp_path: Path) -> None:
+    """Half a megabyte of default attributes took 17 GB in the process of a run, and held its interpreter meanwhile."""
+    attributes = " ".join(f"b{number} CDATA ''" for number in range(5_000))
+    text = f"<!DOCTYPE aem [<!ATTLIST a {attributes}>]><aem>{'<a/>' * 5_000}</aem>"
+    path = write(tmp_path, text)
+    begin_s = time.process_time()
+    with pytest.raises(EmulatorError, match="has a DOCTYPE"):
+        read_truth_file(path)
+    assert time.process_time() - begin_s < 0.5  # two seconds with the attributes
 
 
 # --- convert ---

@@ -47,3 +47,12 @@ def test_the_legend_covers_no_star(corner):
 def test_an_image_too_small_for_a_legend_has_none():
     image = annotate(SKY[:48, :64], np.array([[20.0, 20.0]]), [""], missed_xy_px=np.array([[44.0, 30.0]]))
     assert circles(image, MISS_BGR) == [(44, 30)]
+
+
+def test_between_crowded_corners_the_legend_stands_at_a_free_edge():
+    grid = np.array([(x, y) for x in range(20, 320, 40) for y in range(20, 240, 40)], float)
+    crowded = grid[~((grid[:, 0] > 60) & (grid[:, 0] < 270) & (grid[:, 1] > 160))]
+    image = annotate(SKY, crowded, ["HIP 1"] * len(crowded), missed_xy_px=OTHER)
+    (example,) = set(circles(image, MARK_BGR)) - {tuple(at) for at in crowded}
+    assert 60 < example[0] < 300
+    assert example[1] > 160

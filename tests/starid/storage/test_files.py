@@ -7,6 +7,7 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -157,6 +158,16 @@ def test_a_byte_order_mark_is_not_part_of_the_text(tmp_path: Path) -> None:
 def test_python_only_notation_is_not_a_number(text: str) -> None:
     with pytest.raises(ValueError, match="not a number"):
         read_number(text)
+
+
+@pytest.mark.parametrize("form", ["{}x", "0.{}x", ".{}e", "1e{}x", "{}.{}x", "{}e{}", "+{}-", "{}"])
+def test_a_long_number_is_read_in_a_time_that_grows_with_its_length(form: str) -> None:
+    """A cell of 100 kB in a truth file held the interpreter for a quarter of an hour: a run was silent, and deaf to SIGTERM."""
+    text = form.replace("{}", "9" * 50_000)
+    begin_s = time.process_time()
+    with pytest.raises(ValueError, match="not a number"):
+        read_number(text)
+    assert time.process_time() - begin_s < 1.0  # the square of the length takes a minute
 
 
 @pytest.mark.parametrize(("text", "value"), [("1", 1.0), (" -1.5e3 ", -1500.0), (".5", 0.5), ("2.", 2.0)])

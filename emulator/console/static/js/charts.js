@@ -197,8 +197,9 @@ export class Charts {
     });
     const own = { plan, outputs, range: [0, 1], scale: 0, u: null, box: null };
     const name = plan.title || plan.series.map((each) => each.name).join(", ");
-    legend.append(make("span", { class: "spacer" }), make("button", { type: "button", class: "small", text: "⤓", title: "save as PNG", "aria-label": `save the plot ${name} as PNG`, onclick: () => this.png(own) }));
-    if (plan.own) legend.append(make("button", { type: "button", class: "small", text: "×", "aria-label": `remove the plot ${name}`, onclick: () => { this.own = this.own.filter((each) => each !== plan); this.changed(); } }));
+    const corner = make("span", { class: "corner" }, make("button", { type: "button", class: "small", text: "⤓", title: "save as PNG", "aria-label": `save the plot ${name} as PNG`, onclick: () => this.png(own) }));
+    legend.append(corner);
+    if (plan.own) corner.append(make("button", { type: "button", class: "small", text: "×", "aria-label": `remove the plot ${name}`, onclick: () => { this.own = this.own.filter((each) => each !== plan); this.changed(); } }));
     const box = make("div", { class: "plot" }, legend);
     this.host.append(box);
     if (folded) return own;

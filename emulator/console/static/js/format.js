@@ -82,6 +82,11 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+// A name with underscores, after which a line may break.
+export function name(text) {
+  return text.split("_").flatMap((part, i) => (i ? ["_", document.createElement("wbr"), part] : [part]));
+}
+
 // Show whether a button is on.
 export function press(button, on) {
   button.classList.toggle("on", on);

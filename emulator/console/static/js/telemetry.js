@@ -1,6 +1,6 @@
 // All telemetry rows, decoded live; only rows that are visible or plotted are read.
 
-import { limits, make, setText, value, wall } from "./format.js";
+import { limits, make, name as named, setText, value, wall } from "./format.js";
 
 const STALE_MS = 5000;
 
@@ -51,9 +51,9 @@ export class Telemetry {
     for (const field of row.fields) {
       const cell = make("td", { class: "num val", text: "–" });
       fields.set(field.name, { cell, field });
-      table.append(make("tr", { title: field.doc }, make("th", { scope: "row", text: field.name }), cell, make("td", { class: "unit dim", text: field.unit }), make("td", { class: "num dim lim", text: limits(field) })));
+      table.append(make("tr", { title: field.doc }, make("th", { scope: "row" }, ...named(field.name)), cell, make("td", { class: "unit dim", text: field.unit }), make("td", { class: "num dim lim", text: limits(field) })));
     }
-    const fold = make("button", { type: "button", class: "fold", "aria-expanded": "true", "aria-controls": table.id, title: row.doc }, make("span", { class: "num dim", text: String(row.id) }), make("b", { text: row.name }));
+    const fold = make("button", { type: "button", class: "fold", "aria-expanded": "true", "aria-controls": table.id, title: row.doc }, make("span", { class: "num dim", text: String(row.id) }), make("b", {}, ...named(row.name)));
     const read = make("button", { type: "button", class: "read", text: "read", "aria-label": `read ${row.name}`, title: "read once, as a step of the session", onclick: () => this.link.request({ do: "read", row: row.name }).then((answer) => answer.ok && this.update({ row: row.name, ...answer })) });
     const element = make("section", { class: "row", "data-row": row.name, "aria-label": row.name }, make("div", { class: "row-head" }, fold, make("span", { class: "spacer" }), when, read), table);
     fold.addEventListener("click", () => {

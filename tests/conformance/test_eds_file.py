@@ -1,0 +1,40 @@
+"""EDS files of others: one line says what is wrong with them."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.emulator.cli.command_line import run_command_line
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("garbage", "not a valid EDS: File contains no section headers"),
+        ("[a]\n[a]\n", "not a valid EDS: While reading from"),
+        ("[1000]\n", "not a valid EDS: No option 'ParameterName'"),
+        ("[a]\nb" + " " * 50_000 + "c\n", "not a valid EDS: a line has more than 1000 characters"),
+    ],
+    ids=["no section", "section twice", "no name", "long line"],
+)
+def test_an_eds_that_is_none_is_rejected_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "unit.eds"
+    path.write_text(text)
+    begin_s = time.process_time()
+    status, _, errors = run_command_line(
+        "conformance", "--can", "virtual:eds", "--canopen", "44", "--eds", str(path)
+    )
+    assert time.process_time() - begin_s < 5.0
+    assert status == 2
+    assert said in errors
+    assert errors.count("\n") == 1
+
+
+def test_an_eds_that_never_ends_is_not_read() -> None:
+    status, _, errors = run_command_line(
+        "conformance", "--can", "virtual:eds", "--canopen", "44", "--eds", "/dev/zero"
+    )
+    assert (status, errors) == (2, "starhil: /dev/zero: the EDS cannot be read: not a regular file\n")

@@ -1,0 +1,93 @@
+"""The error that features alone state in a sequence of images is the error that they have, at rest and while the body turns.
+
+An answer is right to a fraction of a degree, or at another place of the sky. The images of a sequence show the same stars, so only
+sequences are independent: in the worst case all images of one are right, or all are wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
+from starhil.emulator.sensor.pipeline.messages import FrameRequest
+from starhil.emulator.truth.source import TruthState
+from starid.attitude import propagate, random_attitude
+
+pytestmark = pytest.mark.long
+
+SEQUENCES = 30
+IMAGES = 8
+SIGMAS = 4.0
+"""Tolerance in standard deviations of the mean of independent sequences."""
+RIGHT_DEG = 1.5
+LIKELY_RIGHT = 0.1
+"""Probability of another place of the sky below which an answer is said to be right: those said to be so are judged apart."""
+
+
+@cache
+def device(profile: str) -> EcssDevice:
+    return EcssDevice(EcssPlan(profile, ("run.algorithm=rsi", "identifier.refinement=false")))
+
+
+@cache
+def answers(profile: str, rate_deg_s: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Of each sequence: errors over stated ones, squared (n, 3); angles between the boresights, degrees; and stated probabilities."""
+    unit, found = device(profile), []
+    for number in range(SEQUENCES):
+        rng = np.random.default_rng((45, number))
+        attitude, axis = random_attitude(rng), rng.normal(size=3)
+        rate = math.radians(rate_deg_s) * axis / np.linalg.norm(axis)
+        squares, off, wrong = [], [], []
+        predicted = None
+        for image in range(IMAGES):
+            request = FrameRequest(
+                IMAGES * number + image, TruthState(attitude, rate), unit.exposure_s, unit.gain, unit.settings,
+                temperature_c=unit.mean_c,
+            )  # fmt: skip
+            identifier = unit.pipeline.identifier(request)
+            if image == 0:
+                identifier.reset()
+            detections, _ = unit.pipeline.detections(request)
+            solution = unit.pipeline.solution(detections, replace(request, predicted=predicted), identifier)
+            predicted = propagate(solution.attitude, rate, 1.0) if solution.valid else None
+            if solution.valid:
+                error = solution.attitude.error_to(attitude)
+                squares.append(error.rotation_vector_rad**2 / np.diag(solution.covariance))
+                off.append(error.cross_boresight_arcsec / 3600.0)
+                wrong.append(solution.probability_false)
+            attitude = propagate(attitude, rate, 1.0)
+        if squares:
+            found.append((np.array(squares), np.array(off), np.array(wrong)))
+    return found
+
+
+CASES = [(profile, rate) for profile in ("ideal", "cubestar", "thesis") for rate in (0.0, 0.3, 2.0)]
+
+
+@pytest.mark.parametrize(("profile", "rate_deg_s"), CASES)
+def test_squared_errors_are_the_stated_ones(profile: str, rate_deg_s: float) -> None:
+    for axes in (slice(0, 2), slice(2, 3)):
+        means = np.array([np.mean(squares[:, axes]) for squares, _, _ in answers(profile, rate_deg_s)])
+        assert len(means) > 0.9 * SEQUENCES
+        # a square is 0 or, with the probability p of another place, 1/p: its variance is 1/p − 1
+        expected = np.mean([1.0 / np.mean(wrong) - 1.0 for _, _, wrong in answers(profile, rate_deg_s)])
+        sampling = math.sqrt(max(expected, np.var(means, ddof=1)) / len(means))
+        assert np.mean(means) == pytest.approx(1.0, abs=SIGMAS * sampling)
+
+
+@pytest.mark.parametrize(("profile", "rate_deg_s"), CASES)
+def test_places_are_wrong_as_often_as_stated(profile: str, rate_deg_s: float) -> None:
+    for low, high in ((0.0, LIKELY_RIGHT), (LIKELY_RIGHT, 1.01)):
+        excess = variance = 0.0
+        for _, off, wrong in answers(profile, rate_deg_s):
+            chosen = (wrong >= low) & (wrong < high)
+            if chosen.any():
+                stated = wrong[chosen].mean()
+                excess += float(np.sum((off[chosen] > RIGHT_DEG) - wrong[chosen]))
+                variance += np.count_nonzero(chosen) ** 2 * stated * (1.0 - stated)
+        assert abs(excess) <= SIGMAS * math.sqrt(variance)
