@@ -201,6 +201,7 @@ def test_a_page_for_viewing_only_has_no_control_that_commands(browser, emulator)
 def test_what_was_sent_is_saved_and_run_as_a_session(page, emulator, tmp_path):
     page.click("[data-tab=telecommands]")
     page.click("#clear-session")
+    page.wait_for_function("() => document.querySelectorAll('#sent li').length === 0")
     send(page, "set_mode", mode="standby")
     send(page, "set_mode", mode="lost_in_space")
     send(page, "set_update_rate", rate=500)

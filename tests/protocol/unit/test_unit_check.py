@@ -114,7 +114,7 @@ FAILING = {
     "own base": ("class E(BaseException): pass\nraise E('a\\nb')\n", "E: a b"),
     "syntax": ("def f(:\n", "SyntaxError"),
     "file not found": ("open('/no/such/file')\n", "FileNotFoundError"),
-    "null": ("a\0b\n", "SyntaxError: source code string cannot contain null bytes"),
+    "null": ("a\0b\n", "Error: source code string cannot contain null bytes"),
     "check raises": (PLUGIN.replace("return bytes((reduce", "raise SystemExit((reduce"), "plugin fails in check parity: SystemExit: (0,)"),
     "check of no bytes": (PLUGIN.replace("return bytes((reduce(xor, covered, 0),))", "return 3"), "check parity must return bytes, not int"),
     "framing constructor": (PLUGIN.replace("self.lines = ", "self.lines = 1 / 0 or "), "fails in framing lines: ZeroDivisionError"),

@@ -223,7 +223,7 @@ export class Charts {
       padding: [0.4 * rem, 0.9 * rem, last ? 0 : 0.3 * rem, 0],
       scales: { x: { time: false, range: () => [this.from, this.to] }, y: { range: () => own.range } },
       axes: [
-        { ...axis, show: true, size: last ? 1.5 * rem : 2, splits: () => Array.from({ length: 7 }, (_, part) => this.to - ((this.to - this.from) * (6 - part)) / 6), values: (_, times) => times.map((time) => (last ? before(time - this.store.present) : "")) },
+        { ...axis, show: true, size: last ? 1.5 * rem : 2, splits: () => Array.from({ length: 7 }, (_, part) => this.to - ((this.to - this.from) * (6 - part)) / 6), values: (_, times) => times.map((time) => (last ? before(time - this.drawn) : "")) },
         { ...axis, size: 3.6 * rem, space: 1.6 * rem, values: (_, values) => values.map((item) => String(Number(item.toPrecision(6))).replace("-", "−")) },
       ],
       series,
@@ -276,6 +276,7 @@ export class Charts {
   // While paused, the window is kept, unless the cursor leaves it.
   setSpan() {
     const { store } = this;
+    this.drawn = store.present; // what the labels of the time axis count from, also when a plot is drawn again by itself
     if (this.zoomed) {
       [this.from, this.to] = this.zoomed;
       return;
@@ -295,7 +296,7 @@ export class Charts {
     const { rows } = this.store;
     if (!rows || document.hidden) return;
     if (rows.length) this.setSpan();
-    else [this.from, this.to] = [-this.window, 0];
+    else [this.from, this.to, this.drawn] = [-this.window, 0, 0];
     const picked = pick(rows, this.from, this.to);
     for (const plot of this.plots) this.fill(plot, rows, picked);
     this.drawModes(rows);
