@@ -350,7 +350,7 @@ class Oracle:
             elif quantity in self._checks:
                 self._checks[quantity](where, field, value)
             elif (known := self._expected(quantity, field)) is not None:
-                self._expect(where, field, value, *known)
+                self._expect(where, field, value, *known, span=_SPANS.get(quantity))
             elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF:
                 self._learn(quantity, value)
 
@@ -379,16 +379,23 @@ class Oracle:
             raise Violation(f"{where}: {value!r}, but the parameter {name} is {expected!r}")
 
     def _expect(
-        self, where: str, field: Field, value: Value, expected: float, tolerance: float = 0.0
+        self,
+        where: str,
+        field: Field,
+        value: Value,
+        expected: float,
+        tolerance: float = 0.0,
+        *,
+        span: int | None = None,
     ) -> None:
-        """Check a number, which telemetry clips or wraps to the range of its field."""
+        """Check a number, which telemetry clips or wraps to the range of its field; `span` is that at which it wraps by itself."""
         if not isinstance(value, (int, float)):
             return
         low, high = field.limits
         step = abs(field.scale) if field.kind != "float" else 0.0
-        if field.wrap:
-            span = high - low + step
-            off = abs((float(value) - expected + 0.5 * span) % span - 0.5 * span)
+        circle = high - low + step if field.wrap else span
+        if circle:
+            off = abs((float(value) - expected + 0.5 * circle) % circle - 0.5 * circle)
         else:
             off = abs(float(value) - min(max(expected, low), high))
         if off > tolerance + field.resolution + FLOAT_GRAIN.get(field.type, 0.0) * abs(expected):
@@ -427,8 +434,7 @@ class Oracle:
             case "request.last" if self._last is not None:
                 number = self._last[0]
             case "clock.unix" | "clock.seconds" if (clock_s := self._clock_s()) is not None:
-                wraps_s = 2**64 if quantity == "clock.unix" else 2**32
-                return clock_s % wraps_s, 1.0 if field.kind != "float" else 1e-6
+                return clock_s % _SPANS.get(quantity, 2**64), 1.0 if field.kind != "float" else 1e-6
             case "uptime" | "uptime.seconds" if (uptime_s := self._uptime_s()) is not None:
                 return uptime_s * (factor("s", field.unit) or 1.0), 1.01
         return None if number is None else (number, tolerance)
@@ -501,5 +507,7 @@ _FRACTIONS: Final = {
     "uptime.milliseconds": 1e3,
 }
 """Units of the parts of a second in one second."""
+_SPANS: Final = {"clock.seconds": 2**32}
+"""Spans, in the unit of the quantity, at which it wraps whatever the field."""
 _CLOCK: Final = {"unix": "s", "seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
 """Units in which the arguments of `set_clock` are understood."""

@@ -138,6 +138,15 @@ def test_a_refusal_without_an_answer_is_reported_by_telemetry_that_comes_before_
     assert run_once(Life("cubestar", 1, ("serial", "can"), profile, steps)).violation == ""
 
 
+def test_seconds_of_a_clock_that_is_about_to_wrap_may_be_the_last_or_the_first():
+    steps = (
+        {"do": "request", "link": "can", "row": ["", 2, "telecommand"], "data": "ffffffffffc99a3b"},
+        {"do": "request", "link": "can", "row": ["", 175, "telemetry"]},
+    )
+    profile = {"parameters": {"start_mode": "standby"}}
+    assert run_once(Life("cubestar-gen2", 1, ("serial", "can"), profile, steps)).violation == ""
+
+
 @pytest.mark.parametrize(("row", "data"), [(8, "58818bfce2"), (7, "79"), (9, "040010"), (13, "000010")])
 def test_data_of_a_telecommand_may_end_early_where_the_definition_says_so(row, data):
     short = {"do": "request", "link": "serial", "row": ["", row, "telecommand"], "data": data}
