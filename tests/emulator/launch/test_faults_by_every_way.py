@@ -336,10 +336,10 @@ def recorded(run, tmp_path):
         """Answer as the pipeline does, and let the number of matched stars tell which optical faults it was given."""
         result = handle(request)
         if isinstance(request, FrameRequest) and request.solve:
-            told = (
+            reported = (
                 zlib.crc32(json.dumps(request.faults, sort_keys=True).encode()) % 200 if request.faults else 0
             )
-            result = replace(result, matched=4 + told)
+            result = replace(result, matched=4 + reported)
         return result
 
     run.pipeline.handle = seeing

@@ -162,7 +162,7 @@ def test_python_only_notation_is_not_a_number(text: str) -> None:
 
 @pytest.mark.parametrize("form", ["{}x", "0.{}x", ".{}e", "1e{}x", "{}.{}x", "{}e{}", "+{}-", "{}"])
 def test_a_long_number_is_read_in_a_time_that_grows_with_its_length(form: str) -> None:
-    """A cell of 100 kB in a truth file held the interpreter for a quarter of an hour: a run was silent, and deaf to SIGTERM."""
+    """A cell of 100 kB in a truth file held the interpreter for a quarter of an hour: a run was unresponsive, also to SIGTERM."""
     text = form.replace("{}", "9" * 50_000)
     begin_s = time.process_time()
     with pytest.raises(ValueError, match="not a number"):
