@@ -171,10 +171,13 @@ def test_a_header_that_is_not_ascii_is_answered_400(run, caplog, header):
     ("request_", "status"),
     [
         ("GET /static/" + 300 * "a", 404),
+        ("GET /static/%00", 404),
+        ("GET /static/js/../../server.py", 404),
+        ("GET /docs/" + 300 * "a" + "?{token}", 400),
         ("POST /runs?{token}", 400),
         ("POST /runs", 403),
     ],
-    ids=["name", "body", "body without the token"],
+    ids=["long name", "null byte", "other folder", "long page", "body", "body without the token"],
 )
 def test_a_name_or_a_body_that_cannot_be_read_leaves_no_error_in_the_log(run, caplog, request_, status):
     async def scenario(emulation, _line):
