@@ -100,7 +100,7 @@ def read_csv(path: Path, text: str) -> FileTruth:
             doubt = doubt_of_orbit(orbit[-1])
             if doubt:
                 raise EmulatorError(f"{where}: {doubt}")
-            doubt = doubt_between(*orbit[-2:], times[-1] - times[-2]) if len(orbit) > 1 else ""
+            doubt = doubt_between(orbit[-2], orbit[-1], times[-1] - times[-2]) if orbit[1:] else ""
             if doubt:
                 raise EmulatorError(f"truth file {path} line {before}: {doubt}")
         if has_rates:
