@@ -26,6 +26,7 @@ from typing import Final
 from starid.storage.cache import KERNEL_SUFFIX, cache_dir, evict, kernel_folder, make_kernel_folder, mark_used
 from starid.storage.files import write_atomically
 from starid.storage.temporary_folder import locked, make_temporary_folder
+from starid.storage.working_folder import check_working_folder
 
 _log = logging.getLogger(__name__)
 
@@ -52,6 +53,7 @@ def use_kernel_cache() -> bool:
     Where the folder in the cache cannot be written, a copy of it in the temporary folder is used, which is removed at the
     end of the process; if that leaves kernels to be compiled, a warning is logged.
     """
+    check_working_folder()
     key = sources_key()
     folder = kernel_folder(key)
     try:
