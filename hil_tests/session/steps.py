@@ -37,6 +37,7 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.values import Value
+from starid.storage.files import check_links
 
 CLOCK_GRAIN_S: Final = 1e-6
 
@@ -159,6 +160,7 @@ class Sample(ReadingStep):
         problems: list[str] = []
         last = Attempt()
         begin = time.monotonic()
+        check_links(session.folder / name)
         with (session.folder / name).open("w", newline="", encoding="utf-8", buffering=1) as stream:
             writer = csv.writer(stream)
             writer.writerow(["obc_time_s", "latency_ms", *fields])

@@ -21,7 +21,8 @@ def test_a_link_that_another_user_has_made_is_not_followed(tmp_path: Path) -> No
     target.write_bytes(b"precious")
     os.lchown(link, 12345, 12345)
     with pytest.raises(
-        EmulatorError, match=r"log\.csv: a link that user 12345 has made; choose another file"
+        EmulatorError,
+        match=r"log\.csv: cannot be written \(a link that user 12345 has made\); choose another file",
     ):
         OutputFile("truth log", link, overwrite=True)
     assert target.read_bytes() == b"precious"

@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from starhil.hil_tests.client.wire_log import WireLog
 from starid.attitude import Attitude, turn_text
 from starid.camera.file import load_camera
 from starid.catalog.hipparcos import read_hip2
+from starid.cli.output import prepare_output
 from starid.errors import StaridError
 from starid.identification.thesis.database import DatabaseError
 from starid.identification.thesis.database_file import load_database
@@ -66,6 +68,25 @@ def test_a_link_to_a_file_stays_a_link_and_the_file_is_replaced(tmp_path: Path) 
     assert link.is_symlink()
     assert target.read_bytes() == b"second"
     assert list(target.parent.iterdir()) == [target]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a link to another user")
+@pytest.mark.parametrize("hidden", [False, True], ids=["", "behind an own link"])
+def test_a_link_of_another_user_is_not_followed(tmp_path: Path, *, hidden: bool) -> None:
+    """In /tmp, it could lead to any file of this user, which was replaced."""
+    target, link, own = tmp_path / "precious", tmp_path / "image.png", tmp_path / "own"
+    target.write_bytes(b"precious")
+    link.symlink_to(target)
+    own.symlink_to(link.name)
+    os.lchown(link, 12345, 12345)
+    path = own if hidden else link
+    with pytest.raises(PermissionError, match="a link that user 12345 has made"):
+        write_atomically(path, lambda part: part.write_bytes(b"whole"))
+    with pytest.raises(StaridError, match=r"cannot be written \(a link that user 12345 has made\)"):
+        prepare_output(path, "-o")
+    with pytest.raises(PermissionError, match="a link that user 12345 has made"):
+        WireLog(path)
+    assert target.read_bytes() == b"precious"
 
 
 def test_a_folder_is_not_overwritten(tmp_path: Path) -> None:
