@@ -410,11 +410,11 @@ BOUNDED_BY_LENGTH_1 = "quaternion_xyzw"
 
 @pytest.mark.parametrize("model", [Profile, Scenario])
 def test_every_number_of_a_profile_and_a_scenario_has_both_bounds(model):
-    found = dict(_numbers(model.model_json_schema()))
-    assert len(found) > 30
+    numbers = dict(_numbers(model.model_json_schema()))
+    assert len(numbers) > 30
     unbounded = [
         path
-        for path, schema in found.items()
+        for path, schema in numbers.items()
         if not ({"minimum", "exclusiveMinimum"} & schema.keys() and "maximum" in schema)
         and not path.endswith(BOUNDED_BY_LENGTH_1)
     ]

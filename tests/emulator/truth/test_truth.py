@@ -140,7 +140,7 @@ def test_file_takes_angles_rates_and_repeats(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "empty"),
         ("t,qx,qy,qz,qw\n", "no rows"),
@@ -175,11 +175,11 @@ def test_file_takes_angles_rates_and_repeats(tmp_path):
         ("t,qx,qy,qz,qw\n0,0,0,0," + "1" * 200_000 + "\n", "line 2: not CSV"),
     ],
 )
-def test_bad_files_are_named_by_line(tmp_path, text, said):
+def test_bad_files_are_named_by_line(tmp_path, text, message):
     path = write(tmp_path, text)
     with pytest.raises(EmulatorError) as refusal:
         read_truth_file(path)
-    assert said in str(refusal.value)
+    assert message in str(refusal.value)
     assert str(path) in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
@@ -287,7 +287,7 @@ def test_live_feed_on_simulation_time_uses_message_times_unchanged():
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("nonsense", "JSON"),
         ("[1]", "object"),
@@ -305,12 +305,12 @@ def test_live_feed_on_simulation_time_uses_message_times_unchanged():
         ('{"q": [0, 0, 0, 1], "rate": [0, 1e9, 0]}', "rate exceeds 600"),
     ],
 )
-def test_bad_messages_are_counted_and_named_and_change_nothing(text, said):
+def test_bad_messages_are_counted_and_named_and_change_nothing(text, message):
     live = LiveTruth(EAST)
     live.receive(line(0.0, ORION), 0.0)
     assert not live.receive(text, 0.5)
     assert (live.accepted, live.refused) == (1, 1)
-    assert said in live.last_fault
+    assert message in live.last_fault
     assert apart_arcsec(live.state(0.0).attitude, ORION) < MILLIARCSECOND
 
 

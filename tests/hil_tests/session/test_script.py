@@ -283,7 +283,7 @@ def test_every_wrong_field_of_a_step_is_reported(load):
 
 
 @pytest.mark.parametrize(
-    ("step", "said"),
+    ("step", "message"),
     [
         (  # a value that is known only when the step runs hides nothing
             "command = 'set_parameter'\nwith = { parameter = '$now_s' }",
@@ -310,11 +310,11 @@ def test_every_wrong_field_of_a_step_is_reported(load):
         ("set_parameter = 'exposure'\nvalu = 5\nlink = 'cn'", ["value: missing", "valu: ", "link: "]),
     ],
 )  # fmt: skip
-def test_a_step_with_several_errors_reports_each_once(load, step, said):
+def test_a_step_with_several_errors_reports_each_once(load, step, message):
     with pytest.raises(ScriptError) as caught:
         load(f"[[step]]\n{step}")
-    assert len(caught.value.args) == len(said)
-    for text in said:
+    assert len(caught.value.args) == len(message)
+    for text in message:
         assert any(text in problem for problem in caught.value.args)
 
 
@@ -328,15 +328,21 @@ def test_a_captured_value_may_be_used_by_later_steps_only(load):
 
 def test_bytes_are_written_in_hexadecimal_and_compared_as_bytes(load):
     zeros, ones = bytes(16), b"\xff" * 16
-    wanted = f"value = '{zeros.hex()}', one_of = ['{zeros.hex(' ').upper()}', '$map'], not = '{ones.hex()}'"
+    conditions = (
+        f"value = '{zeros.hex()}', one_of = ['{zeros.hex(' ').upper()}', '$map'], not = '{ones.hex()}'"
+    )
     script = load(
         "[[step]]\nread = 'hole_map_1'\ncapture = { map = 'map' }\n"
-        f"[[step]]\nread = 'hole_map_1'\nexpect = {{ map = {{ {wanted} }} }}"
+        f"[[step]]\nread = 'hole_map_1'\nexpect = {{ map = {{ {conditions} }} }}"
     )
-    wanted = script.steps[1].expect["map"]
-    assert (wanted.equals, wanted.one_of, wanted.differs_from) == (zeros, [zeros, Variable("map")], ones)
-    assert wanted.mismatch("map", zeros, {"map": ones}) is None
-    assert wanted.mismatch("map", ones, {"map": ones}) is not None
+    conditions = script.steps[1].expect["map"]
+    assert (conditions.equals, conditions.one_of, conditions.differs_from) == (
+        zeros,
+        [zeros, Variable("map")],
+        ones,
+    )
+    assert conditions.mismatch("map", zeros, {"map": ones}) is None
+    assert conditions.mismatch("map", ones, {"map": ones}) is not None
 
 
 @pytest.mark.parametrize("wanted", ["true", "'true'", "{ not = false }", "{ one_of = [true] }"])
