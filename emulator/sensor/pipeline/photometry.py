@@ -1,4 +1,4 @@
-"""What a detector finds: the magnitude at which it still finds 90 % of the stars, and its error of a magnitude there.
+"""The limit of a detector: the magnitude at which it finds 90 % of the stars, and the error of a magnitude there.
 
 The features of the thesis count stars down to a magnitude, so they must not count what the detector often misses. It is
 measured as a laboratory would: fields of the sky at rest are rendered and their stars detected.
