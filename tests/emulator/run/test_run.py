@@ -223,31 +223,6 @@ def test_every_scenario_of_the_product_is_valid(name):
     assert load_scenario(name).name == name
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "not a scenario: has no events, each under [[at]]; its keys are none"),
-        ("[run]\nseed = 1\n[truth]\nkind = 'fixed'\n", "its keys are run, truth"),
-        ("[[at]]\nrun_time_s = 1.0\n", "give fault, truth or clear_faults"),
-        (
-            "[[at]]\nrun_time_s = 1.0\nfault = { optical = { false_star = 1 } }\n",
-            "at.0.fault.optical.false_star: unknown key",
-        ),
-        ("[[at]]\nrun_time_s = 1.0\ntruth = { kind = 'live' }\n", "live feed"),
-        ("[[at]]\nrun_time_s = -1.0\nclear_faults = true\n", "run_time_s"),
-        ("[[at", "not valid TOML"),
-    ],
-)
-def test_a_bad_scenario_is_named_with_file_and_key(tmp_path, text, message):
-    path = tmp_path / "day.toml"
-    path.write_text(text)
-    with pytest.raises(EmulatorError) as refusal:
-        load_scenario(str(path))
-    assert message in str(refusal.value)
-    assert str(path) in str(refusal.value)
-    assert "\n" not in str(refusal.value)
-
-
 @pytest.mark.parametrize("name", ["bad_dya", ""])
 def test_an_unknown_scenario_is_answered_with_the_known_ones(name):
     with pytest.raises(EmulatorError, match=f"scenario '{name}': not found; give a path, or one of: bad_day"):
