@@ -10,6 +10,8 @@ import pytest
 from starid.imaging.detection import DetectionSettings, detect
 from starid.imaging.unmodelled_light import shift_by_hidden_stars
 
+pytestmark = pytest.mark.long
+
 SIGMA_PX = 0.8
 WIDTH_PX = math.sqrt(SIGMA_PX**2 + 1.0 / 12.0)
 FLUX = 1000.0
