@@ -453,6 +453,24 @@ def test_during_a_simulation_only_inputs_are_set(tumbling: tuple[Unit, Iterator[
     unit.step(next(motion))
 
 
+def test_a_start_is_a_time_before_the_simulation(
+    tumbling: tuple[Unit, Iterator[np.void]], fmu3: Path, tmp_path: Path
+) -> None:
+    """A start that was given later moved the clock of the simulation."""
+    unit, motion = tumbling
+    unit.step(next(motion))
+    with refused("fmi3EnterInitializationMode"):
+        unit.slave.enterInitializationMode(startTime=1000.0)
+    assert unit.messages[-1].startswith("start at 1000 s: ")
+    assert unit.get("time") == pytest.approx(unit.time)
+    unit.step(next(motion))
+    with unit_of(fmu3, tmp_path) as other:
+        for start in (float("nan"), float("inf")):
+            with refused("fmi3EnterInitializationMode"):
+                other.slave.enterInitializationMode(startTime=start)
+        assert other.get("time") == 0.0
+
+
 def test_a_variable_of_another_type_and_an_output_are_refused(fmu3: Path, tmp_path: Path) -> None:
     with unit_of(fmu3, tmp_path) as unit:
         for name, kind in (

@@ -171,10 +171,13 @@ def test_a_header_that_is_not_ascii_is_answered_400(run, caplog, header):
     ("request_", "status"),
     [
         ("GET /static/" + 300 * "a", 404),
+        ("GET /static/%00", 404),
+        ("GET /static/js/../../server.py", 404),
+        ("GET /docs/" + 300 * "a" + "?{token}", 400),
         ("POST /runs?{token}", 400),
         ("POST /runs", 403),
     ],
-    ids=["name", "body", "body without the token"],
+    ids=["long name", "null byte", "other folder", "long page", "body", "body without the token"],
 )
 def test_a_name_or_a_body_that_cannot_be_read_leaves_no_error_in_the_log(run, caplog, request_, status):
     async def scenario(emulation, _line):
@@ -843,6 +846,31 @@ def test_results_of_any_size_are_kept_in_bounded_memory():
     assert last["results"][-1]["log"][-1] == "{'z': 199}"
     assert "log" not in last["results"][0]
     assert "unknown" not in last["results"][0]
+
+
+def test_a_page_that_opens_does_not_encode_all_results_again():
+    """With ten runs of 400 results, pages that opened delayed replies from 13 to 260 ms."""
+    runs = ReportedRuns()
+    runs.report({"event": "begin", "run": "a"})
+    for number in range(1000):
+        result = {
+            "status": "failed",
+            "id": str(number),
+            "name": "é" * 100,
+            "detail": "x" * 400,
+            "log": ["y" * 200],
+        }
+        runs.report({"event": "result", "run": "a", "result": result})
+    (message,) = runs.messages()
+    content = json.loads(message)
+
+    def cost(work):
+        begin_s = time.process_time()
+        work()
+        return time.process_time() - begin_s
+
+    encoding_s = min(cost(lambda: json.dumps(content)) for _ in range(5))
+    assert min(cost(lambda: list(runs.messages())) for _ in range(5)) < 0.3 * encoding_s
 
 
 def test_a_report_to_no_console_is_an_error_in_one_line(run):
