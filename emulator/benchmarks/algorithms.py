@@ -187,7 +187,6 @@ def _kept(detections: Detections, missing: int, rng: np.random.Generator) -> Ind
 
 
 def _rows(detections: Detections, rows: Indices) -> Detections:
-    """Some of the detections."""
     columns: dict[str, Any] = {
         name: value[rows]
         for name, value in vars(detections).items()

@@ -179,7 +179,9 @@ def campaigns(
         print("\n".join(figure_names()))
         return
     coverage_factor(images.confidence)  # before hours of work
-    wanted = () if images.requirements is None else read_requirements(images.requirements, figure_names())
+    requirements = (
+        () if images.requirements is None else read_requirements(images.requirements, figure_names())
+    )
     if output is not None:
         import_module("matplotlib")
         import_module("fpdf")
@@ -188,15 +190,15 @@ def campaigns(
     folder = None if output is None else output / "parts"
     finished = list(_with_progress(run_ecss(plan, folder=folder, jobs=images.jobs), len(parts(plan))))
     report = make_report(plan, finished, images.confidence)
-    files = () if output is None else write_report(report, images.command(), wanted, output)
+    files = () if output is None else write_report(report, images.command(), requirements, output)
     measured = report.named_figures()
-    verdicts = {item.id: item.verdict(measured[item.figure]) for item in wanted}
+    verdicts = {item.id: item.verdict(measured[item.figure]) for item in requirements}
     if as_json:
         print(
             json.dumps({**report.figures(), "requirements": verdicts, "files": [str(file) for file in files]})
         )
     elif output is None:
-        print(as_markdown(report, images.command(), wanted))
+        print(as_markdown(report, images.command(), requirements))
     else:
         print(f"report written to {output / 'report.md'}, .html and .pdf")
         for item, verdict in verdicts.items():

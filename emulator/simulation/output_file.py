@@ -113,7 +113,6 @@ class OutputFile:
             rest = rest[written:]
 
     def close(self) -> None:
-        """Close the file."""
         self.stream.close()
 
     def discard(self) -> None:
@@ -124,7 +123,16 @@ class OutputFile:
                 self.path.unlink()
 
     def _open(self, *, overwrite: bool) -> io.FileIO:
-        """Open and empty the file for one writer; a pipe is rejected, as its reader could block the emulator."""
+        """Open and empty the file for one writer; a pipe is rejected, as its reader could block the emulator.
+
+        So is a link that another user has made, as in /tmp: it may lead to any file of ours.
+        """
+        with contextlib.suppress(FileNotFoundError):
+            link = self.path.lstat()
+            if stat.S_ISLNK(link.st_mode) and link.st_uid not in (0, os.geteuid()):
+                raise EmulatorError(
+                    f"{self._name}: a link that user {link.st_uid} has made; choose another file"
+                )
         flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
         file = os.fdopen(os.open(self.path, flags, 0o644), "wb", buffering=0)
         try:

@@ -134,7 +134,6 @@ def _asks_for_an_emulator(script: Script) -> bool:
 
 
 def start_command(script: Script, folder: Path) -> str:
-    """Return the command that starts an emulator for a script."""
     emulator = script.emulator
     settings = pointed(script.truth.attitude, emulator.settings)
     words = ["starhil", "run", *([emulator.profile] if emulator.profile else [])]

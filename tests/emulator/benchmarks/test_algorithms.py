@@ -4,6 +4,8 @@ import pytest
 
 from starhil.emulator.benchmarks.algorithms import AlgorithmPlan, Scene, run_algorithms
 
+pytestmark = pytest.mark.long
+
 IMAGES = 8
 
 

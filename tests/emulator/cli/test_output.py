@@ -51,12 +51,12 @@ def commands(group: Any = None, path: str = "") -> list[tuple[str, Any]]:
     """Every command of both programs with its path."""
     if group is None:
         programs = (app.build_app(), library.build_app())
-        return [found for program in programs for found in commands(typer.main.get_command(program))]
-    found: list[tuple[str, Any]] = []
+        return [each for program in programs for each in commands(typer.main.get_command(program))]
+    each: list[tuple[str, Any]] = []
     for name, command in group.commands.items():
         below = f"{path} {name}".strip()
-        found += commands(command, below) if hasattr(command, "commands") else [(below, command)]
-    return found
+        each += commands(command, below) if hasattr(command, "commands") else [(below, command)]
+    return each
 
 
 def test_every_option_that_names_a_file_to_write_states_the_rule() -> None:

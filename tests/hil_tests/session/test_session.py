@@ -288,11 +288,11 @@ def test_the_truth_of_a_script_points_the_emulator_that_is_started(own, tmp_path
     )
     options = LinkOptions(serial="auto")
     emulator = _emulator(SessionRequest(path, options), load_script(path, ICD), options, tmp_path, tmp_path)
-    given = [setting for option, setting in pairwise(emulator.command) if option == "--set"]
+    settings = [setting for option, setting in pairwise(emulator.command) if option == "--set"]
     if own:  # settings of the script's own go before
-        assert given == [own]
+        assert settings == [own]
         return
-    attitude = load_profile("cubestar", given).truth.attitude.build()
+    attitude = load_profile("cubestar", settings).truth.attitude.build()
     assert (
         attitude_error(
             unit(attitude.quaternion_xyzw.tolist()), from_radec_roll(201.3, -11.2, 5.0)
