@@ -21,7 +21,7 @@ PIPELINE: Final = "starhil.emulator.sensor.pipeline.pipeline"
 
 async def report_slow_start(algorithms: Iterable[str]) -> None:
     """Report the progress of a start with some algorithms on stderr every `PROGRESS_S`, until cancelled."""
-    from starid.identification.star_identifier import ALGORITHMS
+    from starid.identification.options import ALGORITHMS
     from starid.kernels.compile_progress import CompileProgress
 
     begin_s = time.monotonic()
