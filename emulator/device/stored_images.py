@@ -54,6 +54,7 @@ class StoredImage:
 
     @cached_property
     def file_crc(self) -> int:
+        """Checksum of the file."""
         return file_checksum(self.content())
 
     def content(self) -> bytes:
@@ -90,9 +91,11 @@ class JpgFile:
 
     @cached_property
     def file_crc(self) -> int:
+        """Checksum of the file."""
         return file_checksum(self.data)
 
     def content(self) -> bytes:
+        """Return the file."""
         return self.data
 
 
