@@ -369,7 +369,6 @@ class _ServerLog(logging.LoggerAdapter[logging.Logger]):
     """Logs a request that is not HTTP, or whose body cannot be decoded, at level debug: its peer could fill the log."""
 
     def log(self, level: int, msg: object, *args: object, **options: Any) -> None:
-        """Log an event of the HTTP server."""
         error = options.get("exc_info")
         if error is True:
             error = sys.exception()

@@ -114,7 +114,6 @@ class OutputFile:
             rest = rest[written:]
 
     def close(self) -> None:
-        """Close the file."""
         self.stream.close()
 
     def discard(self) -> None:

@@ -67,7 +67,6 @@ class Command(RequestStep):
                     yield f"with: {self.row.name}.{name}: {error}"
 
     def run(self, session: SessionState, link: str) -> Attempt:
-        """Send the telecommand."""
         data = self.raw
         if data is None:
             variables = session.variables
@@ -83,7 +82,6 @@ class ReadingStep(Step):
 
     @property
     def reading(self) -> Row | None:
-        """The row that the step reads."""
         return self.row
 
 
@@ -94,7 +92,6 @@ class Read(ReadingStep, RequestStep):
     row: Readable = Field(alias="read")
 
     def run(self, session: SessionState, link: str) -> Attempt:
-        """Read the row."""
         attempt, reading = self.exchange(session.rig.client(link).read, self.row.name)
         return attempt if reading is None or attempt.problem else self.judged(session, reading)
 
@@ -239,7 +236,6 @@ class GetParameter(Step):
 
     @property
     def reading(self) -> Row | None:
-        """The row that the step reads."""
         return self._row
 
     def _problems(self, info: ValidationInfo) -> Iterator[str]:
@@ -247,7 +243,6 @@ class GetParameter(Step):
         yield from super()._problems(info)
 
     def run(self, session: SessionState, link: str) -> Attempt:
-        """Read the parameter."""
         return self.judged(session, session.rig.client(link).read_parameter(self.parameter.name))
 
 
@@ -319,7 +314,6 @@ class Wait(Step):
     seconds: Duration = Field(alias="wait_s")
 
     def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- any session, no link
-        """Wait."""
         time.sleep(self.seconds)
         return Attempt()
 
@@ -333,7 +327,6 @@ class Restart(Step):
     signal: Literal["term", "kill"] = Field(alias="restart")
 
     def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- no link
-        """Restart the emulator."""
         session.rig.restart(self.signal)
         return Attempt(detail="ready again")
 
@@ -348,7 +341,6 @@ class Control(Step):
     keys: Annotated[dict[str, Any], AfterValidator(check_json)] = Field({}, alias="with")
 
     def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- no link
-        """Send the request."""
         return Attempt(detail=in_words(session.rig.control(self.action, self.keys)))
 
 

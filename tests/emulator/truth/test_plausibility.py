@@ -139,7 +139,7 @@ CSV = "t,qx,qy,qz,qw,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s\n0,0,0,0,1,{},0,0,0,{},0\n
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (OEM.format(*(7.2e6, 7440.0) * 2), "position and velocity seem to be in metres instead of kilometres"),
         (OEM.format(*(7200.0, 7440.0) * 2), "velocity seems to be in metres per second instead of kilometres per second"),
@@ -147,12 +147,12 @@ CSV = "t,qx,qy,qz,qw,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s\n0,0,0,0,1,{},0,0,0,{},0\n
         (STK.format("DistanceUnit Kilometers\n", *(7.2e6, 7440.0) * 2), "position and velocity seem to be in metres instead of kilometres"),
     ],
 )  # fmt: skip
-def test_an_orbit_file_in_wrong_units_names_file_and_units(tmp_path: Path, text: str, said: str) -> None:
+def test_an_orbit_file_in_wrong_units_names_file_and_units(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "orbit"
     path.write_text(text)
     with pytest.raises(EmulatorError) as error:
         read_orbit_file(path)
-    assert str(error.value) == f"orbit file {path}: {said}"
+    assert str(error.value) == f"orbit file {path}: {message}"
 
 
 def test_positions_of_a_truth_file_in_wrong_units_are_named_by_line(tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_positions_of_a_truth_file_in_wrong_units_are_named_by_line(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("position", "velocity", "said"),
+    ("position", "velocity", "message"),
     [
         (
             [7.2e3, 0.0, 0.0],
@@ -180,11 +180,13 @@ def test_positions_of_a_truth_file_in_wrong_units_are_named_by_line(tmp_path: Pa
         ),
     ],
 )
-def test_a_state_of_a_profile_in_wrong_units_is_named(position, velocity, said: str, tmp_path: Path) -> None:
+def test_a_state_of_a_profile_in_wrong_units_is_named(
+    position, velocity, message: str, tmp_path: Path
+) -> None:
     config = StateConfig(kind="state", position_m=position, velocity_m_s=velocity)
     with pytest.raises(EmulatorError) as error:
         config.build(RUN, tmp_path)
-    assert str(error.value) == f"orbit: {said}"
+    assert str(error.value) == f"orbit: {message}"
 
 
 def test_the_status_shows_a_feed_of_another_date(run) -> None:

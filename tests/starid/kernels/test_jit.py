@@ -206,12 +206,12 @@ def test_what_a_process_replaces_while_another_one_records_is_kept(
         kernel_cache.record_checksums(folder)
 
     def checksum(file: Path) -> int:
-        found = read(file)
+        content = read(file)
         if not others:
             others.append(threading.Thread(target=replace))
             others[0].start()
             others[0].join(1.0)
-        return found
+        return content
 
     monkeypatch.setattr(kernel_cache, "_checksum", checksum)
     kernel_cache.record_checksums(folder)

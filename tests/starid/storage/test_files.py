@@ -37,14 +37,14 @@ READERS = [
 def test_a_pipe_receives_the_file_and_stays_a_pipe(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    seen: list[bytes] = []
+    contents: list[bytes] = []
     holder = os.open(pipe, os.O_RDWR)  # so that neither end waits for the other
     try:
         write_atomically(pipe, lambda part: part.write_bytes(b"whole"))
-        seen.append(os.read(holder, 100))
+        contents.append(os.read(holder, 100))
     finally:
         os.close(holder)
-    assert seen == [b"whole"]
+    assert contents == [b"whole"]
     assert stat.S_ISFIFO(pipe.lstat().st_mode)
 
 
@@ -106,24 +106,24 @@ def test_standard_output_is_written_in_place(tmp_path: Path, *, into_file: bool)
     if into_file:
         with file.open("wb") as stream:
             subprocess.run(command, stdout=stream, check=True, timeout=PATIENCE_S)
-        said = file.read_text()
+        text = file.read_text()
     else:
-        said = subprocess.run(
+        text = subprocess.run(
             command, stdout=subprocess.PIPE, text=True, check=True, timeout=PATIENCE_S
         ).stdout
-    assert said == "before\nwhole\nafter\n"
+    assert text == "before\nwhole\nafter\n"
     assert link.is_symlink()
 
 
 def test_a_stream_without_a_suffix_gets_a_png(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    seen: list[bytes] = []
-    reader = threading.Thread(target=lambda: seen.append(pipe.read_bytes()), daemon=True)
+    contents: list[bytes] = []
+    reader = threading.Thread(target=lambda: contents.append(pipe.read_bytes()), daemon=True)
     reader.start()
     write_image(pipe, np.arange(64, dtype=np.uint8).reshape(8, 8))
     reader.join(timeout=PATIENCE_S)
-    assert seen[0].startswith(b"\x89PNG")
+    assert contents[0].startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(("reader", "error_type"), READERS)
