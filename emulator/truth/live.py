@@ -98,8 +98,8 @@ class LiveTruth:
         self._received_s = 0.0
         """Simulation time at which the last message was accepted."""
         self._held: deque[_HeldMessage] = deque(maxlen=HISTORY)
-        self._doubts = self._speeds = 0
-        """How often the feed has become implausible, and has had another speed than the clock."""
+        self._doubts = 0
+        """How often the feed has become implausible."""
 
     def set_run(self, clock_speed: float, start_unix_s: float) -> None:
         """Set the simulation time per wall time, by default 1, 0 if time passes only on request; and the date of the run."""
@@ -180,8 +180,7 @@ class LiveTruth:
         """Report a speed that differs from the clock's, and discard the states whose times no longer hold."""
         if self.timeline == "anchor":
             self._held.clear()
-        self._speeds += self.speed.differs
-        if self.speed.differs and _is_reported(self._speeds):
+        if self.speed.differs:
             wall = rounded_speed(self.speed.ratio * self._clock_speed)
             scaled = f"--clock scaled:{wall:g}, or " if wall <= MAX_SCALE else ""
             log.warning(
