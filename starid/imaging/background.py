@@ -46,7 +46,8 @@ class Background:
     ----------
     level, noise : ndarray (rows, columns), float32
         Value at the centre of a block, and standard deviation about the plane through its pixels, both without
-        stars; counts.
+        stars; counts. Blocks without any noise, as behind a dark body, have the typical one: between them and
+        those beside, where stars are seen, noise is not less.
     block_px : float
         Side of a block; the centre of block (i, j) lies at ((j + ½)·block − ½, (i + ½)·block − ½).
     """
@@ -62,9 +63,8 @@ class Background:
 
     @cached_property
     def median_noise(self) -> float:
-        """Typical noise of a pixel, counts, where light reaches the image: blocks without any noise are left out."""
-        lit = self.noise[self.noise > np.float32(1.001 * MIN_NOISE_DN)]
-        return median(lit if lit.size else self.noise)
+        """Typical noise of a pixel, counts, where light reaches the image."""
+        return median(self.noise)
 
 
 @compiled_ieee
@@ -186,6 +186,9 @@ def estimate_background(image: GreyImage, block_px: int = BLOCK_PX) -> Backgroun
     level = np.empty((rows, columns), dtype=np.float32)
     noise = np.empty((rows, columns), dtype=np.float32)
     _block_statistics(image, block_px, level, noise)
+    lit = noise > np.float32(1.001 * MIN_NOISE_DN)
+    if lit.any():
+        noise[~lit] = median(noise[lit])
     return Background(level, noise, block_px)
 
 
