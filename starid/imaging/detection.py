@@ -489,7 +489,9 @@ def _level_of_block(background: Background, peaks: Indices32) -> Grid:
     """Level (n,) of the blocks in which peaks lie."""
     rows, columns = background.level.shape
     blocks = peaks // background.block_px
-    return background.level[np.minimum(blocks[:, 1], rows - 1), np.minimum(blocks[:, 0], columns - 1)]
+    return np.asarray(
+        background.level[np.minimum(blocks[:, 1], rows - 1), np.minimum(blocks[:, 0], columns - 1)]
+    )
 
 
 def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float, least: int) -> SpotShape:
