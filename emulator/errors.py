@@ -1,4 +1,4 @@
-"""The error raised by whatever reads a file, opens a port or takes input from outside, and unexpected errors in one line.
+"""The error of files, ports and input from outside, and unexpected errors in one line.
 
 A docstring mentions it only where that does not go without saying.
 """

@@ -140,8 +140,8 @@ def attitude_in(row: Row, values: Mapping[str, Value]) -> Quaternion:
 
     Raises BenchError: the row has no such attitude, it is flagged invalid, or it is no attitude.
     """
-    found = attitude_fields(row)
-    if found is None:
+    named_fields = attitude_fields(row)
+    if named_fields is None:
         raise BenchError(f"row '{row.name}' reports no quaternion, Gibbs vector, MRPs or rotation vector")
     if any(
         values.get(field.name) is False
@@ -149,7 +149,7 @@ def attitude_in(row: Row, values: Mapping[str, Value]) -> Quaternion:
         if field.value == "attitude.valid"
     ):
         raise BenchError(f"the attitude is not valid (reason {values.get('reason', '?')!s})")
-    fields, rotation = found
+    fields, rotation = named_fields
     return rotation([float(values[field.name]) * (factor(field.unit, "rad") or 1.0) for field in fields])
 
 

@@ -47,7 +47,6 @@ class RequestKind(StrEnum):
 
     @classmethod
     def of(cls, row_id: int) -> RequestKind:
-        """Return the kind of a CubeSpace row."""
         return cls.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else cls.TELECOMMAND
 
 
@@ -154,7 +153,6 @@ class Reply:
 
     @classmethod
     def echo(cls, request: Request) -> Reply:
-        """Return the echo of a request."""
         return cls(
             ReplyKind.ECHO,
             request.id,

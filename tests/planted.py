@@ -116,15 +116,15 @@ def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
 
 def _by_name(code: types.CodeType) -> defaultdict[str, list[types.CodeType]]:
     """Return the code of functions by qualified name, those of the same name in the order of their lines."""
-    found: defaultdict[str, list[types.CodeType]] = defaultdict(list)
+    codes: defaultdict[str, list[types.CodeType]] = defaultdict(list)
     waiting = [code]
     while waiting:
         each = waiting.pop()
-        found[each.co_qualname].append(each)
+        codes[each.co_qualname].append(each)
         waiting += [item for item in each.co_consts if isinstance(item, types.CodeType)]
-    for group in found.values():
+    for group in codes.values():
         group.sort(key=lambda item: item.co_firstlineno)
-    return found
+    return codes
 
 
 def _forget() -> None:

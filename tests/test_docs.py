@@ -98,14 +98,14 @@ def numbers(text: str) -> list[float]:
 
 
 def test_the_examples_of_the_sky_are_valid_and_run(tmp_path):
-    found = blocks("sky.md")
-    for block in found:
+    examples = blocks("sky.md")
+    for block in examples:
         if block.language == "toml":
             path = tmp_path / "profile.toml"
             path.write_text(block.text, encoding="utf-8")
             sky = Sky(pipeline_setup(load_profile(str(path))).sky)
             assert sky.by_date
-    (program,) = (block for block in found if block.language == "python")
+    (program,) = (block for block in examples if block.language == "python")
     run(program, {})
 
 
@@ -384,7 +384,7 @@ class Exchange:
 
 
 def exchanges(headings: set[str]) -> list[Exchange]:
-    found = []
+    links = []
     for block in blocks("walkthrough.md"):
         if block.language != "console" or block.heading not in headings:
             continue
@@ -392,8 +392,8 @@ def exchanges(headings: set[str]) -> list[Exchange]:
             typed, *dump = part.splitlines()
             seen = [dumped(line) for line in dump]
             assert str(seen[0]) == typed, "candump shows another frame than cansend sent"
-            found.append(Exchange(f"cansend vcan0 {typed}", seen[0], seen[1:]))
-    return found
+            links.append(Exchange(f"cansend vcan0 {typed}", seen[0], seen[1:]))
+    return links
 
 
 def dumped(line: str) -> CanFrame:

@@ -108,13 +108,13 @@ def accept(command: Any, name: str, words: list[str], parent: Any = None) -> Non
 
 def commands(*, whole: bool) -> dict[tuple[str, ...], str]:
     """Return the commands without a placeholder, each with a page: `whole` ones in blocks, or those within sentences."""
-    found: dict[tuple[str, ...], str] = {}
+    pages: dict[tuple[str, ...], str] = {}
     for page, path in PAGES.items():
         text = _FENCED.sub("\n", path.read_text(encoding="utf-8"))
         lines = [line for block in typed(page) for line in block.lines] if whole else _INLINE.findall(text)
         for line in lines:
-            found |= {tuple(call): page for call in calls(line) if not _PLACEHOLDER.search(" ".join(call))}
-    return found
+            pages |= {tuple(call): page for call in calls(line) if not _PLACEHOLDER.search(" ".join(call))}
+    return pages
 
 
 @pytest.mark.parametrize(("whole", "least"), [(True, 60), (False, 100)], ids=["blocks", "sentences"])
@@ -209,7 +209,7 @@ class Shell:
             self.ready = self._emulators.enter_context(EmulatorProcess(command)).ready
             return ""
         if words[0] in APPS:
-            status, out, said = run_command_line(*words[1:], program=words[0])
+            status, out, stderr = run_command_line(*words[1:], program=words[0])
         else:
             path = f"{Path(installed_command()).parent}:{os.environ['PATH']}"
             done = subprocess.run(
@@ -220,8 +220,8 @@ class Shell:
                 check=False,
                 env={**os.environ, "PATH": path},
             )
-            status, out, said = done.returncode, done.stdout, done.stderr
-        assert status in statuses, (line, out, said)
+            status, out, stderr = done.returncode, done.stdout, done.stderr
+        assert status in statuses, (line, out, stderr)
         return out
 
     def end(self) -> None:

@@ -220,11 +220,11 @@ def test_the_control_channel_answers_as_the_page_shows():
         for request, answer in pairs:
             lines.write(request + "\n")
             lines.flush()
-            given = lines.readline().strip()
+            line = lines.readline().strip()
             begin, _, end = answer.partition("…")
-            assert json.loads(given)["ok"] is json.loads(answer)["ok"]
-            assert given.startswith(begin), given
-            assert given.endswith(end), given
+            assert json.loads(line)["ok"] is json.loads(answer)["ok"]
+            assert line.startswith(begin), line
+            assert line.endswith(end), line
         lines.write("{}\n")
         lines.flush()
         known = json.loads(lines.readline())["error"].removeprefix("do: must be one of ").split(", ")

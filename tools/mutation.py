@@ -308,7 +308,7 @@ def in_fork(function: Callable[..., object], *arguments: object) -> None:
 def try_group(group: str, tests: list[str], options: argparse.Namespace) -> None:
     """Try the sample of a group, and write what became of each mutant."""
     measured = json.loads((OUT / f"{group.replace('/', '-')}.json").read_text("utf-8"))
-    known, running = reasons(), dict[int, dict]()
+    outcomes, running = reasons(), dict[int, dict]()
 
     def finish(most: int) -> None:
         while len(running) > most:
@@ -316,7 +316,7 @@ def try_group(group: str, tests: list[str], options: argparse.Namespace) -> None
             item = running.pop(child)
             item["result"] = judge(child, item.pop("deadline"))
             text = (ROOT / item["module"]).read_text("utf-8").splitlines()[item["line"] - 1].strip()
-            item["reason"] = known.get((item["module"], text, item["change"]), "")
+            item["reason"] = outcomes.get((item["module"], text, item["change"]), "")
             with (OUT / "mutants.jsonl").open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(item) + "\n")
             print(f"{item['module']}:{item['line']}: {item['result']}: {item['change']}", flush=True)

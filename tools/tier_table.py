@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Print what a run of the tests has run: tier, tests run, skipped, why.
+"""Print what a test run covered: tier, tests run, skipped, why.
 
     tools/tier_table.py FOLDER
 

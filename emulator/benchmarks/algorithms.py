@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -70,6 +70,10 @@ class Scene:
             return 2
         return 1 if self.rate_deg_s == 0.0 else SEQUENCE
 
+    def images(self, frames: int) -> int:
+        """Return how many images are made for a number of images that count."""
+        return 2 * frames if self.second else frames
+
     @property
     def name(self) -> str:
         """What the table calls it."""
@@ -118,12 +122,13 @@ class Comparison:
             if name != skipped
         }
 
-    def rows(self, scene: Scene) -> Iterator[dict[str, Any]]:
-        """One row per algorithm: shares, errors, times and memory under a condition."""
+    def rows(self, scene: Scene, seen: Callable[[], object]) -> Iterator[dict[str, Any]]:
+        """One row per algorithm: shares, errors, times and memory under a condition; `seen` is called after each image."""
         tallies = {name: _Tally(device, scene, self.plan.without) for name, device in self.devices.items()}
         for image in self._images(scene):
             for tally in tallies.values():
                 tally.add(image)
+            seen()
         for name, tally in tallies.items():
             yield {
                 "profile": self.plan.profile,
@@ -135,7 +140,7 @@ class Comparison:
     def _images(self, scene: Scene) -> Iterator[_Image]:
         device = next(iter(self.devices.values()))
         attitude, rate = Attitude.identity(), np.zeros(3)
-        for number in range(self.plan.frames * (2 if scene.second else 1)):
+        for number in range(scene.images(self.plan.frames)):
             rng = np.random.default_rng(
                 (self.plan.seed, number, scene.false_stars, scene.missing_stars, scene.length)
             )
@@ -182,7 +187,6 @@ def _kept(detections: Detections, missing: int, rng: np.random.Generator) -> Ind
 
 
 def _rows(detections: Detections, rows: Indices) -> Detections:
-    """Some of the detections."""
     columns: dict[str, Any] = {
         name: value[rows]
         for name, value in vars(detections).items()
@@ -308,8 +312,10 @@ class _Tally:
         }
 
 
-def run_algorithms(plan: AlgorithmPlan, scenes: tuple[Scene, ...] = SCENES) -> Iterator[dict[str, Any]]:
-    """Yield the rows of the table of a profile as they are measured."""
+def run_algorithms(
+    plan: AlgorithmPlan, scenes: tuple[Scene, ...] = SCENES, seen: Callable[[], object] = lambda: None
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of the table of a profile as they are measured; `seen` is called after each image."""
     comparison = Comparison(plan)
     for scene in scenes:
-        yield from comparison.rows(scene)
+        yield from comparison.rows(scene, seen)

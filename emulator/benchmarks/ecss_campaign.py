@@ -96,7 +96,6 @@ class EcssPlan:
     """Frames per part; a resumed campaign repeats only unfinished parts."""
 
     def conditions(self) -> list[Condition]:
-        """Return all conditions of the campaign."""
         static = Condition(STATIC, STATIC, 0.0, self.fields * self.positions * self.repeats)
         thermal = Condition(THERMAL, THERMAL, 0.0, self.thermal_fields * self.thermal_points)
         dated = Condition(DATED, DATED, 0.0, self.dated_fields * self.dates * self.dated_repeats)

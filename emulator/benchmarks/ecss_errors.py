@@ -70,7 +70,6 @@ class ErrorLine:
 
     @property
     def about_arcsec(self) -> float:
-        """Size about the boresight."""
         return math.nan if self.arcsec is None else float(self.arcsec[2])
 
 

@@ -112,7 +112,6 @@ class Stated:
     """Number of images; the errors about two axes in one image are not taken as independent."""
 
     def interval(self, place: int) -> tuple[float, float]:
-        """Return the confidence interval of a share."""
         return interval(round(self.shares[place] * self.frames), self.frames)
 
     @property

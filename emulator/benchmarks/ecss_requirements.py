@@ -63,11 +63,9 @@ class Requirement(Strict):
 
     @property
     def limit(self) -> str:
-        """The limit in words."""
         return f"at least {self.min:g}" if self.min is not None else f"at most {self.max:g}"
 
     def verdict(self, figure: Figure) -> Verdict:
-        """Judge a figure."""
         met = figure.low >= self.min if self.min is not None else figure.high <= (self.max or 0.0)
         missed = figure.high < self.min if self.min is not None else figure.low > (self.max or 0.0)
         return "met" if met else "not met" if missed else "not shown"

@@ -90,7 +90,6 @@ class OrbitDevice(EcssDevice):
         self._default_rates = default_rates(camera.width, camera.height, sensor.pixel_um)
 
     def request(self, number: int) -> FrameRequest:
-        """Return the request for a frame."""
         plan, thermal = self._plan, self.profile.thermal
         since_s = 86_400.0 * plan.days * number / plan.frames
         unix_s = self.start_unix_s + since_s

@@ -5,11 +5,18 @@ from __future__ import annotations
 import signal
 import sys
 
+from starid.errors import StaridError
+from starid.storage.working_folder import check_working_folder
+
 
 def main() -> None:
     """Run the command line; Ctrl-C during imports ends it without a traceback."""
     if sys.maxsize < 2**32:
         raise SystemExit("starhil: needs a 64-bit system: x86-64 or arm64")
+    try:
+        check_working_folder()
+    except StaridError as error:
+        raise SystemExit(f"starhil: {error}") from None
     try:
         if sys.argv[1:2] == ["run"] and "--help" not in sys.argv:
             for number in (signal.SIGTERM, signal.SIGHUP):

@@ -96,7 +96,7 @@ def warm(
 
     async def start(loaded: Profile) -> None:
         run = Run([loaded], previews=True)
-        progress = asyncio.create_task(report_slow_start())
+        progress = asyncio.create_task(report_slow_start([loaded.run.algorithm]))
         try:
             await run.open()
             run.begin()

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -21,6 +22,8 @@ from starid.cli.output import Column, print_table
 from starid.storage.child_processes import importing_only_what_is_installed
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from starhil.emulator.benchmarks.campaign import CampaignPlan
     from starhil.emulator.benchmarks.ecss_campaign import EcssPlan
 
@@ -176,7 +179,9 @@ def campaigns(
         print("\n".join(figure_names()))
         return
     coverage_factor(images.confidence)  # before hours of work
-    wanted = () if images.requirements is None else read_requirements(images.requirements, figure_names())
+    requirements = (
+        () if images.requirements is None else read_requirements(images.requirements, figure_names())
+    )
     if output is not None:
         import_module("matplotlib")
         import_module("fpdf")
@@ -185,15 +190,15 @@ def campaigns(
     folder = None if output is None else output / "parts"
     finished = list(_with_progress(run_ecss(plan, folder=folder, jobs=images.jobs), len(parts(plan))))
     report = make_report(plan, finished, images.confidence)
-    files = () if output is None else write_report(report, images.command(), wanted, output)
+    files = () if output is None else write_report(report, images.command(), requirements, output)
     measured = report.named_figures()
-    verdicts = {item.id: item.verdict(measured[item.figure]) for item in wanted}
+    verdicts = {item.id: item.verdict(measured[item.figure]) for item in requirements}
     if as_json:
         print(
             json.dumps({**report.figures(), "requirements": verdicts, "files": [str(file) for file in files]})
         )
     elif output is None:
-        print(as_markdown(report, images.command(), wanted))
+        print(as_markdown(report, images.command(), requirements))
     else:
         print(f"report written to {output / 'report.md'}, .html and .pdf")
         for item, verdict in verdicts.items():
@@ -373,7 +378,9 @@ def algorithms(
 
     plan = AlgorithmPlan(profile, frames, seed, tuple(with_orbit(setting, orbit)), checked_part(part))
     scenes = SCENES[:1] if lost_only else tuple(each for each in SCENES if (scene or "") in each.name)
-    rows = list(_with_progress(run_algorithms(plan, scenes), 3 * len(scenes)))
+    with _progress() as bar:
+        task = bar.add_task("campaign", total=sum(each.images(frames) for each in scenes))
+        rows = list(run_algorithms(plan, scenes, partial(bar.advance, task)))
     if as_json:
         print(json.dumps(rows))
     else:
@@ -465,9 +472,15 @@ def _warn(plan: EcssPlan) -> None:
         print(f"starhil: campaign: {warning}", file=sys.stderr)
 
 
-def _with_progress(chunks: Any, total: int) -> Any:
+def _with_progress(chunks: Iterable[Any], total: int) -> Iterator[Any]:
     """Show a progress bar on stderr while iterating over the chunks."""
-    from rich.console import Console
-    from rich.progress import track
+    with _progress() as bar:
+        yield from bar.track(chunks, total, description="campaign")
 
-    return track(chunks, "campaign", total=total, console=Console(stderr=True))
+
+def _progress() -> Progress:
+    """Return progress bars on stderr."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    return Progress(console=Console(stderr=True))

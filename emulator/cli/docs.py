@@ -82,11 +82,11 @@ def command(
         for name, text in texts.items():
             print(f"{name:<18}  {text.splitlines()[0].removeprefix(_HEADING)}")
         return
-    wanted = "/".join(page)
-    name = wanted.removeprefix("docs/").partition("#")[0].removesuffix(".md")
+    page_name = "/".join(page)
+    name = page_name.removeprefix("docs/").partition("#")[0].removesuffix(".md")
     name = f"{_INTERFACES}{DEFAULT_UNIT}" if f"{name}/" == _INTERFACES else name
     if name not in texts:
-        raise EmulatorError(f"page {wanted!r}: not found{remedy(name, texts)}")
+        raise EmulatorError(f"page {page_name!r}: not found{remedy(name, texts)}")
     if name.startswith(_INTERFACES):
         print_text(_interface(name.removeprefix(_INTERFACES)))
         return

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
@@ -15,18 +15,26 @@ from starid.cli.output import prepare_output
 
 PROGRESS_S: Final = 5.0
 """Time after which the progress of a slow start is reported, and between reports, seconds."""
+PIPELINE: Final = "starhil.emulator.sensor.pipeline.pipeline"
+"""The module whose kernels every start compiles."""
 
 
-async def report_slow_start() -> None:
-    """Report the progress of a start on stderr every `PROGRESS_S`, until cancelled."""
-    from starid.storage.cache import kernels_written_since
+async def report_slow_start(algorithms: Iterable[str]) -> None:
+    """Report the progress of a start with some algorithms on stderr every `PROGRESS_S`, until cancelled."""
+    from starid.identification.options import ALGORITHMS
+    from starid.kernels.compile_progress import CompileProgress
 
-    begin_s = time.time()
+    begin_s = time.monotonic()
+    await asyncio.sleep(PROGRESS_S)
+    progress = CompileProgress([PIPELINE, *(ALGORITHMS[name].module for name in algorithms)])
+    total = len(progress.kernels)
+    reason = ""
     while True:
+        compiled = progress.compiled()
+        if reason or compiled < total:
+            reason = f", {compiled} of {total} kernels compiled; later starts use them"
+        print(f"starting: {time.monotonic() - begin_s:.0f} s{reason}", file=sys.stderr, flush=True)
         await asyncio.sleep(PROGRESS_S)
-        compiled = kernels_written_since(begin_s)
-        reason = f", {compiled} kernels compiled; later starts use them" if compiled else ""
-        print(f"starting: {time.time() - begin_s:.0f} s{reason}", file=sys.stderr, flush=True)
 
 
 @contextmanager

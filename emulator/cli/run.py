@@ -6,7 +6,7 @@ import asyncio
 import importlib
 import logging
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_args, get_type_hints
@@ -318,10 +318,11 @@ def command(
             "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
         )
     options = around.run_options()
-    return run_loop(_serve(lambda: Emulator(profiles, options, worker)))
+    algorithms = {each.run.algorithm for each in profiles}
+    return run_loop(_serve(lambda: Emulator(profiles, options, worker), algorithms))
 
 
-async def _serve(make: Callable[[], Emulator]) -> int:
+async def _serve(make: Callable[[], Emulator], algorithms: Collection[str]) -> int:
     """Run an emulator, made in the event loop, until a signal or the control channel ends it; return the exit status."""
     import gc
 
@@ -340,7 +341,7 @@ async def _serve(make: Callable[[], Emulator]) -> int:
     try:
         line = asyncio.create_task(_started(emulator))
         stop = asyncio.create_task(emulator.ended.wait())
-        progress = asyncio.create_task(report_slow_start())
+        progress = asyncio.create_task(report_slow_start(algorithms))
         await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
         progress.cancel()
         if line.done():

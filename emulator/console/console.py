@@ -120,7 +120,6 @@ class Console:
         return self._head.icd
 
     def start(self) -> None:
-        """Start listening."""
         device = self._head.device
         device.signals.frame_published.connect(self._frame_published)
         device.signals.mode_changed.connect(self._mode_changed)
@@ -135,7 +134,6 @@ class Console:
         self._tasks = [asyncio.create_task(self._guarded(loop)) for loop in loops]
 
     async def close(self) -> None:
-        """Stop listening."""
         self.trace.close()
         tasks = [*self._tasks, *([self._stars] if self._stars is not None else [])]
         for task in tasks:
@@ -159,13 +157,11 @@ class Console:
     # --- pages ---
 
     def join(self, viewer: Viewer) -> None:
-        """Add a page."""
         self.viewers.add(viewer)
         self.events.add("page", f"a page was opened; {len(self.viewers)} open")
         self._viewers_changed()
 
     def leave(self, viewer: Viewer) -> None:
-        """Remove a page."""
         if viewer in self.viewers:
             self.viewers.discard(viewer)
             self.events.add("page", f"a page was closed or lost; {len(self.viewers)} open")

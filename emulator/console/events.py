@@ -103,7 +103,6 @@ class EventLog:
         return event
 
     def note(self, text: str, at_s: float | None = None) -> RunEvent:
-        """Add a note."""
         return self.add("note", text[:LONGEST_NOTE], at_s=at_s)
 
     def _mode_changed(self, transition: Transition) -> None:

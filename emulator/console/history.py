@@ -72,7 +72,6 @@ class History:
         """Reasons that have occurred; the column `reason` is an index into this list."""
 
     def add(self, measurement: Measurement) -> list[float]:
-        """Add a row for a measurement, and return it."""
         return self._keep(self._row(measurement))
 
     def add_mode(self, mode: Mode, run_s: float, unix_s: float) -> list[float]:

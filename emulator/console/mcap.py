@@ -156,7 +156,6 @@ class McapRecorder:
         self._disk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="record")
 
     def start(self) -> None:
-        """Start recording."""
         head = self._head
         head.imager.watchers.add(self)
         head.device.signals.frame_published.connect(self._record_frame)
@@ -326,7 +325,6 @@ class _Records(io.BufferedIOBase):
         return len(data)
 
     def tell(self) -> int:
-        """Return the position in the file."""
         return self._position
 
     def take(self) -> bytes:

@@ -174,7 +174,6 @@ class ConsoleObc:
         return row, data, physical, ""
 
     async def send(self, name: str, values: Mapping[str, Any]) -> Exchange:
-        """Send a telecommand."""
         row, data, physical, _ = self.encode(name, values)
         return await self._exchange(row, data, physical)
 

@@ -42,9 +42,10 @@ class ReportedRun:
     unit: str
     planned: int
     begin_s: float
-    results: list[dict[str, Any]] = field(default_factory=list)
-    logs: deque[dict[str, Any]] = field(default_factory=deque)
-    """Results with their traffic, oldest first."""
+    results: list[str] = field(default_factory=list)
+    """Results as JSON: each page that opens receives them all, and must not delay the links."""
+    logs: deque[tuple[int, dict[str, Any]]] = field(default_factory=deque)
+    """Results with their traffic and their places in `results`, oldest first."""
     end_s: float | None = None
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(STATUSES, 0))
 
@@ -57,11 +58,12 @@ class ReportedRun:
         self.counts[result["status"]] += 1
         if len(self.results) >= KEPT_RESULTS:
             return
-        self.results.append(result)
         if "log" in result:
-            self.logs.append(result)
+            self.logs.append((len(self.results), result))
+        self.results.append(json.dumps(result))
         if len(self.logs) > KEPT_LOGS:
-            del self.logs.popleft()["log"]
+            place, oldest = self.logs.popleft()
+            self.results[place] = json.dumps({key: value for key, value in oldest.items() if key != "log"})
 
 
 class ReportedRuns:
@@ -121,7 +123,8 @@ class ReportedRuns:
     def messages(self) -> Iterator[str]:
         """Yield the messages that describe all runs to a new page."""
         for run in self._runs.values():
-            yield json.dumps({"type": "run", **run.head(), "results": run.results})
+            head = json.dumps({"type": "run", **run.head()})
+            yield f'{head[:-1]}, "results": [{", ".join(run.results)}]}}'
 
 
 def _shortened(result: dict[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import gzip
 import json
 import logging
@@ -114,6 +113,10 @@ class ConsoleServer:
         self._opening = asyncio.Lock()
         self._exporting = asyncio.Lock()
         """Held while a thread makes an export: several would take the interpreter from the links."""
+        self._static_files = {
+            str(file.relative_to(STATIC)): file for file in STATIC.rglob("*") if file.suffix in KINDS
+        }
+        """Files of the page by their paths in requests: a request is looked up, and never makes a path."""
         self._files: dict[str, tuple[bytes, str]] = {}
         """Files of the page that have been read: compressed, and their tag."""
         self._runner: web.AppRunner | None = None
@@ -199,10 +202,6 @@ class ConsoleServer:
             return web.Response(status=400, text=f"400: the body cannot be read ({error})\n", headers=HEADERS)
         except ConnectionError:  # the page is closed, and nobody reads the response
             return web.Response()
-        except OSError as error:  # of a file whose name no file system can hold
-            if error.errno != errno.ENAMETOOLONG:
-                raise
-            return web.Response(status=404, text="404: no such file\n", headers=HEADERS)
         if not response.prepared:
             response.headers.update(HEADERS)
         return response
@@ -222,10 +221,10 @@ class ConsoleServer:
     async def _static(self, request: web.Request) -> web.Response:
         """Return a file of the page, compressed."""
         path = request.match_info["path"]
-        file = (STATIC / path).resolve()
-        kind = KINDS.get(file.suffix)
-        if kind is None or not file.is_relative_to(STATIC) or not file.is_file():
+        file = self._static_files.get(path)
+        if file is None:
             return web.Response(status=404, text="404: no such file\n")
+        kind = KINDS[file.suffix]
         if path not in self._files:
             data = await asyncio.to_thread(lambda: gzip.compress(file.read_bytes()))
             self._files[path] = data, f'"{zlib.crc32(data):08x}"'
@@ -370,7 +369,6 @@ class _ServerLog(logging.LoggerAdapter[logging.Logger]):
     """Logs a request that is not HTTP, or whose body cannot be decoded, at level debug: its peer could fill the log."""
 
     def log(self, level: int, msg: object, *args: object, **options: Any) -> None:
-        """Log an event of the HTTP server."""
         error = options.get("exc_info")
         if error is True:
             error = sys.exception()
@@ -426,8 +424,8 @@ def _is_same_origin(request: web.Request) -> bool:
 async def _docs(request: web.Request) -> web.StreamResponse:
     """Return a page of the documentation, in Markdown."""
     page = request.match_info["page"]
-    path = DOCS / f"{page}.md"
-    if not page.replace("-", "").isalnum() or not path.is_file():
+    path = next((each for each in DOCS.glob("*.md") if each.stem == page), None)
+    if path is None:
         raise EmulatorError(f"docs: there is no page {escape_controls(page)}")
     return web.Response(text=path.read_text(encoding="utf-8"), content_type="text/plain", charset="utf-8")
 

@@ -70,7 +70,6 @@ class WireTrace:
         self._passed.connect(self._add)
 
     def close(self) -> None:
-        """Stop listening."""
         self._passed.disconnect(self._add)
 
     def _add(self, item: WireItem) -> None:

@@ -313,10 +313,9 @@ class ControlServer:
             raise EmulatorError(
                 f"phase: must be one of {', '.join(phases)}{did_you_mean(str(phase), phases)}"
             )
-        head.device.cycle.check_awaits()
         reached = asyncio.Event()
-        self._run.wiring.enter(AwaitedPhase, phase=phase)
         head.device.cycle.at_phase(phase, lambda _due_ns: reached.set())
+        self._run.wiring.enter(AwaitedPhase, phase=phase)
         if self._run.stepper is not None:
             await self._run.stepper.step(within_s, reached.is_set)
         else:

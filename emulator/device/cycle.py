@@ -140,7 +140,6 @@ class FrameCycle:
 
     @property
     def running(self) -> bool:
-        """Whether the sensor is exposing."""
         return self._next is not None
 
     @property

@@ -51,11 +51,9 @@ class FileDownload:
     # --- the list ---
 
     def rewind(self) -> None:
-        """Go to the first file."""
         self._go_to(0)
 
     def advance(self) -> None:
-        """Go to the next file."""
         self._go_to(self.state.position + 1)
 
     def _go_to(self, position: int) -> None:

@@ -69,7 +69,6 @@ class ImageStore:
         self.state = replace(self.state, **changes)
 
     def load_chunk(self, number: int) -> None:
-        """Load a chunk of the open image."""
         self._change(chunk_number=number)
 
     def file(self, kind: str, number: int) -> StoredFile | None:
@@ -83,7 +82,6 @@ class ImageStore:
         return found is not None
 
     def erase_all(self) -> None:
-        """Erase all files."""
         self._change(files=())
 
     def save(self, edge: int) -> None:
@@ -162,7 +160,6 @@ class ImageStore:
             then()
 
     def _store(self, answer: ImageResult) -> None:
-        """Store an image."""
         number = self._next_number(StoredImage.kind)
         self._add(StoredImage(answer.width, answer.pixels, answer.frame, number, self._time.unix_ns()))
 

@@ -133,7 +133,6 @@ class Parameters(Mapping[str, ParameterValue]):
         return len(self.state.current)
 
     def number(self, name: str) -> float:
-        """Return a parameter as the number that is sent on the bus."""
         return self._definitions[name].to_number(self[name])
 
     def definition(self, name: str) -> Parameter:
@@ -171,7 +170,6 @@ class Parameters(Mapping[str, ParameterValue]):
         return flipped
 
     def set_defaults(self) -> None:
-        """Set all parameters to their defaults."""
         self._assign(self.state.defaults)
 
     def adopt_defaults(self, defaults: Mapping[str, Value]) -> None:

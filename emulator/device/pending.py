@@ -26,7 +26,6 @@ class PendingAnswer(Generic[Result]):
 
     @property
     def done(self) -> bool:
-        """Whether the work is done."""
         return bool(self._results)
 
     def end(self, result: Result) -> None:

@@ -1,4 +1,4 @@
-"""Whether the quantities of a unit's plugin have values that their fields can hold, tried on a device in memory."""
+"""Checks, on a device in memory, that the quantities of a unit's plugin fit their fields."""
 
 from __future__ import annotations
 

@@ -66,7 +66,6 @@ class PowerModel:
         return lasting
 
     def phase(self, timing: FrameTiming, now_ns: int) -> Phase:
-        """Return the phase at a simulation time."""
         if not timing.running:
             return Phase.IDLE
         since_s = ((now_ns - timing.start_ns) / NANOSECONDS) % timing.period_s
@@ -144,11 +143,9 @@ class ThermalModel:
         self.state = ThermalState(config)
 
     def start(self, now_ns: int, power_w: float) -> None:
-        """Start at the temperature of the mounting."""
         self._change(now_ns, 0.0, power_w)
 
     def set_power(self, now_ns: int, power_w: float) -> None:
-        """Change the mean power."""
         self._change(now_ns, self.state.heating_c(now_ns), power_w)
 
     def _change(self, now_ns: int, rise_c: float, power_w: float) -> None:

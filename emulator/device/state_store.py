@@ -42,7 +42,6 @@ class MemoryStore:
         return content
 
     def save(self, content: dict[str, Any]) -> None:
-        """Save the content."""
         self._text = json.dumps(content)
 
     def close(self) -> None:
@@ -89,7 +88,6 @@ class FileStore:
             replace_durably(self.path, _encode(content))
 
     def close(self) -> None:
-        """Release the folder."""
         os.close(self._lock)
 
 

@@ -70,7 +70,6 @@ class Surroundings:
         return self.state(self._now_ns()).orbit is not None
 
     def conditions(self, truth: TruthState) -> Conditions:
-        """Return the current conditions of the detector."""
         position_m = None if truth.orbit is None else truth.orbit.position_m
         radiation = self._radiation
         particles_s = particle_rate(

@@ -49,7 +49,6 @@ VECTOR_PART: Final = frozenset(
 
 
 def nanoseconds(seconds: float) -> int:
-    """Return a time in nanoseconds."""
     return round(seconds * NANOSECONDS)
 
 
@@ -239,11 +238,9 @@ class TelemetryFaults:
 
     @property
     def settings(self) -> list[TelemetryFault]:
-        """The present faults."""
         return [each.fault for each in self._injected]
 
     def inject(self, faults: Sequence[TelemetryFault], now_ns: int) -> None:
-        """Replace the present faults."""
         self._injected = []
         for fault in faults:
             self._number += 1
@@ -390,7 +387,6 @@ def _number_in(field: RowField, value: float) -> Value:
 
 
 def _with_attitude_of(past: Measurement, frame: Measurement) -> Measurement:
-    """Return a frame with the attitude of an earlier one."""
     return replace(
         frame,
         result=past.result,

@@ -160,8 +160,6 @@ class PlayedPipeline:
         self.pending = 0
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
-        """Pass a request to the pipeline."""
-
         def arrived(reply: PipelineReply) -> None:
             self._arrived.append((done, reply))
 

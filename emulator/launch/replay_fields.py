@@ -62,7 +62,7 @@ def differing_fields(
     """
     before, now = _messages(recorded, new_decoder()), _messages(passed, new_decoder())
     decoder = new_decoder()
-    found: list[FieldDifference] = []
+    differences: list[FieldDifference] = []
     for name in sorted({*before, *now}):
         old, new = before.get(name, []), now.get(name, [])
         row = decoder.row_named(name)
@@ -78,7 +78,7 @@ def differing_fields(
                     abs(float(other) - float(one)) for _, one, other in differing if _are_numbers(one, other)
                 ]
                 largest = max(sizes) if sizes else None
-                found.append(
+                differences.append(
                     FieldDifference(
                         link, name, field, unit, len(pairs), len(differing), largest, *differing[0]
                     )
@@ -86,12 +86,12 @@ def differing_fields(
         if len(old) != len(new) and (to_the_end or len(new) > len(old)):
             compared, more = min(len(old), len(new)), abs(len(old) - len(new))
             first_s = max(old, new, key=len)[compared][0]
-            found.append(
+            differences.append(
                 FieldDifference(
                     link, name, NUMBER, "", compared, more, float(more), first_s, len(old), len(new)
                 )
             )
-    return found
+    return differences
 
 
 def as_csv(differences: Iterable[FieldDifference]) -> str:
@@ -115,7 +115,7 @@ def _are_numbers(one: Value, other: Value) -> bool:
 
 
 def _messages(items: Iterable[WireItem], decoder: Decoder) -> Messages:
-    found: defaultdict[str, list[tuple[float, Mapping[str, Value]]]] = defaultdict(list)
+    by_row: defaultdict[str, list[tuple[float, Mapping[str, Value]]]] = defaultdict(list)
     for item in items:
         if not item.outgoing:
             decoder.events(item)
@@ -124,10 +124,10 @@ def _messages(items: Iterable[WireItem], decoder: Decoder) -> Messages:
             if isinstance(event, Reply):
                 row = decoder.row_of(event)
                 name = event.kind.value if row is None else row.name
-                found[name].append((item.at_s, _values(event, decoder)))
+                by_row[name].append((item.at_s, _values(event, decoder)))
         if isinstance(item.item, CanFrame) and not item.item.extended:
-            found[canopen_text(item.item)].append((item.at_s, {"data": item.item.data}))
-    return found
+            by_row[canopen_text(item.item)].append((item.at_s, {"data": item.item.data}))
+    return by_row
 
 
 def _values(reply: Reply, decoder: Decoder) -> Mapping[str, Value]:

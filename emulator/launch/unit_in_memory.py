@@ -106,11 +106,9 @@ class MemoryWiring(Wiring):
         self._buses = buses
 
     def serial(self, name: str, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (no port is opened)
-        """Return the serial line."""
         return self._port
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002 (no bus is opened)
-        """Return a CAN bus."""
         return self._buses[name]
 
 
@@ -271,7 +269,6 @@ class UnitUnderTest:
         self.head.faults.inject(request)
 
     def clear_faults(self) -> None:
-        """End all faults."""
         self.run.wiring.enter(ClearedFaults)
         self.head.faults.clear()
 
@@ -306,7 +303,6 @@ class UnitUnderTest:
         resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard) if full else self._unlimited)
 
     def set_peer(self, link: str, *, reads: bool) -> None:
-        """Set whether the peer of a link reads."""
         self._transports[link].reads = reads
 
     # --- what the bus does not show ---
@@ -328,11 +324,9 @@ class UnitUnderTest:
         return len(list(Path("/proc/self/fd").iterdir()))
 
     def queued_events(self) -> int:
-        """Return the number of events in the queue of the device."""
         return self.head.device.scheduler.count
 
     def memory_bytes(self) -> int:
-        """Return the resident memory of this process."""
         pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
         return pages * resource.getpagesize()
 
@@ -352,5 +346,4 @@ def _processor_time_s(process: int) -> float:
 
 
 def links_of(icd: InterfaceDefinition) -> tuple[str, ...]:
-    """Return the names of a unit's links."""
     return tuple(name for name, kind in LINKS.items() if kind.is_of(icd))

@@ -88,7 +88,6 @@ class Link(ABC, Generic[Item]):
         return {self.bus: self.transport.description}
 
     async def close(self) -> None:
-        """Close the transport."""
         if self._timer is not None:
             self._timer.cancel()
         await self.transport.close()

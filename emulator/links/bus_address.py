@@ -79,7 +79,6 @@ class BusAddress:
             log.warning("%s; change one of them: %s", problem, self._remedy)
 
     def release(self) -> None:
-        """Release the address."""
         if self._lock is not None:
             self._lock.close()
             self._lock = None

@@ -98,7 +98,6 @@ class DeviceSample:
             raise
 
     def parameter(self, name: str) -> Value:
-        """Return the value of a parameter in its unit."""
         return self._shot.parameters[name]
 
 
@@ -118,7 +117,6 @@ class DeviceApplication:
         self._last_image = None
 
     def sample(self) -> DeviceSample:
-        """Return the device at this moment."""
         return DeviceSample(self._requests, self._device.snapshot(), self.hits)
 
     def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
@@ -245,7 +243,6 @@ class CanopenLink(Link[CanFrame]):
 
     @property
     def ready_fields(self) -> dict[str, str]:
-        """Fields of the ready line."""
         return super().ready_fields | {"canopen": str(self._wanted_node)}
 
     async def close(self) -> None:

@@ -64,7 +64,6 @@ class LinkSite:
 
     @property
     def profile(self) -> Profile:
-        """Profile of the head."""
         return self.requests.device.profile
 
     @property
@@ -119,7 +118,6 @@ class LinkKind(ABC):
         """Return the value of `key`; `off` or 0 if the link is not requested."""
 
     def opens(self, links: LinksConfig, icd: InterfaceDefinition) -> bool:
-        """Return whether the link is opened."""
         return self.setting(links) not in ("off", 0) and self.is_of(icd)
 
     @abstractmethod

@@ -171,7 +171,6 @@ class Decoder:
         return None if message.id is None else self._icd.row(message.id, message.message_class)
 
     def row_named(self, name: str) -> Row | None:
-        """Return the row of a name."""
         return next((row for row in self._icd.rows if row.name == name), None)
 
     def _text(self, event: Request | Reply | LinkFault) -> tuple[str, str]:

@@ -42,7 +42,6 @@ class WireFault(Strict):
 
     @property
     def none(self) -> bool:
-        """Whether no fault is set."""
         return not (self.drop or self.corrupt or self.delay_s or self.split or self.junk)
 
 

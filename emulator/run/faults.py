@@ -74,7 +74,6 @@ class Effect:
     """Whether it is injected after a restart in the same request, which would end it."""
 
     def names(self, icd: InterfaceDefinition) -> list[str]:
-        """Return the names that the key takes."""
         return [name for name, code in icd.model.enums[self.enum].values.items() if code != self.no_fault]
 
 
@@ -279,7 +278,6 @@ class Faults:
         device.signals.faults_changed.emit({})
 
     def describe(self) -> dict[str, Any]:
-        """Return the current faults by level."""
         active: dict[str, Any] = {}
         if self._device.surroundings.faults:
             active["optical"] = self._device.surroundings.faults

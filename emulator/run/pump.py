@@ -39,12 +39,10 @@ class ClockPump:
         scheduler.added.connect(self._event_added)
 
     def start(self) -> None:
-        """Start to run events."""
         self._running = True
         self._schedule_next()
 
     def stop(self) -> None:
-        """Stop running events."""
         self._running = False
         if self._timer is not None:
             self._timer.cancel()

@@ -65,7 +65,6 @@ class LinkItem(TimedEntry):
 
     @staticmethod
     def data_of(item: bytes | CanFrame) -> str | tuple[int, str, bool, bool]:
-        """Return the data of an item."""
         if isinstance(item, CanFrame):
             return item.id, item.data.hex(), item.extended, item.remote
         return item.hex()

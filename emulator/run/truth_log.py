@@ -151,7 +151,6 @@ class TruthLog:
         self.close = self.file.close
 
     def write(self, measurement: Measurement) -> None:
-        """Write the row of a measurement."""
         self.file.append(lambda: self._row(measurement))
 
     def _row(self, measurement: Measurement) -> bytes:

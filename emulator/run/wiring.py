@@ -32,11 +32,9 @@ class Wiring:
         return make()
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002 (the name is for others)
-        """Return the transport of a CAN link."""
         return make()
 
     def imager(self, inner: PipelineClient) -> PipelineClient:
-        """Return the pipeline for the device."""
         return inner
 
     def background(self, inner: Background) -> Background:

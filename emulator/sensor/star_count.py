@@ -28,14 +28,14 @@ def few_stars(camera: Mapping[str, Any], sensor: SensorModel, settings: Mapping[
     """
     sensor = sensor.with_(exposure_s=settings["exposure"] / 1000.0, gain=settings["analog_gain"])
     pixel_rad = 1.0 / math.sqrt(math.prod(camera["focal_px"]))
-    found = sensor.faintest_magnitude(pixel_rad, settings["detection_threshold"])
+    faintest = sensor.faintest_magnitude(pixel_rad, settings["detection_threshold"])
     limit = settings["limiting_magnitude"]
-    stars = mean_stars(camera, min(found, limit))
+    stars = mean_stars(camera, min(faintest, limit))
     if stars >= FEW_STARS:
         return ""
     cause, remedy = f"parameters.limiting_magnitude is {limit:g}", "raise it, or widen the field"
-    if found < limit:
-        cause = f"the detector finds stars to about V {found:.1f}"
+    if faintest < limit:
+        cause = f"the detector finds stars to about V {faintest:.1f}"
         remedy = "widen the field, or gather more light: sensor.aperture_m, parameters.exposure"
     return (
         f"the field has {stars:.1f} stars on average, since {cause}; with fewer than some {FEW_STARS:g}, "

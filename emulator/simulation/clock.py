@@ -125,11 +125,9 @@ class LatchedClock:
         return self._now_ns
 
     def switch_on(self, wall_ns: int, limit_ns: int) -> None:
-        """Switch on the running clock."""
         self.running.switch_on(wall_ns, limit_ns)
 
     def start(self) -> None:
-        """Start the running clock."""
         self.running.start()
 
     def latch(self) -> None:
@@ -202,7 +200,6 @@ class DeviceTime:
         self.since_ns = now_ns
 
     def set_unix_ns(self, unix_ns: int) -> None:
-        """Set the current Unix time, nanoseconds."""
         self.since_ns = self.clock.now_ns()
         self.offset_ns = unix_ns - self.since_ns
         self.was_set = True

@@ -1,4 +1,4 @@
-"""Base of every configuration model of the emulator, models of plain records, and types of keys that several have."""
+"""Base class of the emulator's configuration models, models of plain records, and key types that several share."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Fields of plain records with the limits that hold when a table of a file is read (`config_model.model_of`)."""
+"""Fields of plain records, with limits that are checked when they are read from a file (`config_model.model_of`)."""
 
 from __future__ import annotations
 

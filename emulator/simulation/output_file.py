@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from starhil.emulator.errors import EmulatorError, one_line
+from starid.storage.files import check_links
 
 log: Final = logging.getLogger("starhil.output")
 
@@ -113,7 +114,6 @@ class OutputFile:
             rest = rest[written:]
 
     def close(self) -> None:
-        """Close the file."""
         self.stream.close()
 
     def discard(self) -> None:
@@ -124,7 +124,11 @@ class OutputFile:
                 self.path.unlink()
 
     def _open(self, *, overwrite: bool) -> io.FileIO:
-        """Open and empty the file for one writer; a pipe is rejected, as its reader could block the emulator."""
+        """Open and empty the file for one writer; a pipe is rejected, as its reader could block the emulator.
+
+        So is a link of another user.
+        """
+        check_links(self.path)
         flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
         file = os.fdopen(os.open(self.path, flags, 0o644), "wb", buffering=0)
         try:

@@ -10,14 +10,15 @@ from typing import Final
 PR_SET_PDEATHSIG: Final = 1
 
 
-def end_with_parent(parent: int | None = None, number: int = signal.SIGKILL) -> None:
-    """Have the kernel send this process a signal when the thread that started it ends.
+def end_with_parent(parent: int) -> None:
+    """Have the kernel kill this process when the thread that started it ends.
 
-    If the process `parent` ended before this call, the signal is raised here. OSError if `prctl` failed.
+    If that ended before this call, so that `parent` is not the parent any more, it is killed here. OSError if
+    `prctl` failed.
     """
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.prctl(PR_SET_PDEATHSIG, int(number)) != 0:
+    if libc.prctl(PR_SET_PDEATHSIG, int(signal.SIGKILL)) != 0:
         error = ctypes.get_errno()
         raise OSError(error, f"prctl: {os.strerror(error)}")
-    if parent is not None and os.getppid() != parent:
-        signal.raise_signal(number)
+    if os.getppid() != parent:
+        signal.raise_signal(signal.SIGKILL)

@@ -30,6 +30,5 @@ class Signal(Generic[Message]):
             self.observers.remove(observer)
 
     def emit(self, message: Message) -> None:
-        """Report a message."""
         for observer in self.observers:
             call_guarded(self.name, observer, message)

@@ -24,7 +24,6 @@ class _AbandonedThreads(Executor):
     def submit(
         self, function: Callable[Arguments, Result], /, *args: Arguments.args, **kwargs: Arguments.kwargs
     ) -> Future[Result]:
-        """Begin a call."""
         future: Future[Result] = Future()
 
         def run() -> None:

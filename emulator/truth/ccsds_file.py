@@ -72,12 +72,10 @@ class Segment:
 
 
 def is_ccsds(text: str) -> bool:
-    """Whether a text is a CCSDS message."""
     return text.startswith(("CCSDS_", "<"))
 
 
 def read_aem(path: Path, text: str) -> FileTruth:
-    """Read the attitudes of an AEM."""
     where = f"truth file {path}"
     version, segments = _segments(where, "AEM", text)
     for number, segment in enumerate(segments, 1):

@@ -66,7 +66,6 @@ def profile_paths(model: type[BaseModel]) -> dict[str, InProfileFolder]:
 
 
 def models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models in an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for inner in get_args(annotation) for model in models_in(inner)]
@@ -97,7 +96,6 @@ class AttitudeConfig(Strict):
         return self
 
     def build(self) -> Attitude:
-        """Make the attitude."""
         if self.quaternion_xyzw is not None:
             return Attitude(np.array(self.quaternion_xyzw))
         return Attitude.from_radec_roll(self.ra_deg or 0.0, self.dec_deg or 0.0, self.roll_deg or 0.0)
@@ -187,7 +185,6 @@ class FixedConfig(StartConfig):
     kind: Literal["fixed"]
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
-        """Make the source."""
         return FixedTruth(self.attitude.build())
 
 
@@ -212,7 +209,6 @@ class HoldConfig(Strict):
     """Duration."""
 
     def build(self) -> Segment:
-        """Make the segment."""
         return RateSegment(self.seconds, ZERO_RATE)
 
 
@@ -227,7 +223,6 @@ class TurnConfig(Strict):
     """Body rate about x, y and z of the sensor frame."""
 
     def build(self) -> Segment:
-        """Make the segment."""
         return RateSegment(self.seconds, np.radians(self.rate_deg_s))
 
 
@@ -247,7 +242,6 @@ class SlewToConfig(Strict):
     """Acceleration of `limited`."""
 
     def build(self) -> Segment:
-        """Make the segment."""
         return SlewSegment(
             self.to.build(),
             math.radians(self.max_rate_deg_s),
@@ -290,7 +284,6 @@ class FileConfig(SourceConfig):
     """Whether to start again after the last row."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:
-        """Read the file."""
         start_s = now_s if self.start == "now" else 0.0
         return replace(read_truth(folder / self.path), start_s=start_s, repeat=self.repeat)
 
@@ -324,7 +317,6 @@ class LiveConfig(SocketConfig):
 
     @property
     def socket(self) -> Socket:
-        """Socket of the feed."""
         return "udp" if self.protocol == "udp" else "listen"
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
@@ -360,7 +352,6 @@ class Config42(SocketConfig):
 
     @property
     def socket(self) -> Socket:
-        """Socket of the feed."""
         return "connect" if self.role == "client" else "listen"
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)

@@ -20,6 +20,7 @@ from __future__ import annotations
 import csv
 import math
 from collections import Counter
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -29,7 +30,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.feed_message import checked_attitude
 from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError
 from starhil.emulator.truth.orbit import OrbitState
-from starhil.emulator.truth.plausibility import doubt_of_orbit
+from starhil.emulator.truth.plausibility import doubt_between, doubt_of_orbit
 from starhil.emulator.truth.source import MAX_RATE_DEG_S
 from starhil.emulator.truth.table import FileTruth
 from starhil.protocol.files.user_file import read_user_text
@@ -82,7 +83,7 @@ def read_csv(path: Path, text: str) -> FileTruth:
     attitudes: list[Attitude] = []
     rates: list[list[float]] = []
     orbit: list[OrbitState] = []
-    for number, line in lines[1:]:
+    for (before, _), (number, line) in pairwise(lines):
         where = f"truth file {path} line {number}"
         row = _parse_row(where, columns, line)
         if times and row["t"] - times[-1] < SHORTEST_S:
@@ -99,6 +100,9 @@ def read_csv(path: Path, text: str) -> FileTruth:
             doubt = doubt_of_orbit(orbit[-1])
             if doubt:
                 raise EmulatorError(f"{where}: {doubt}")
+            doubt = doubt_between(orbit[-2], orbit[-1], times[-1] - times[-2]) if orbit[1:] else ""
+            if doubt:
+                raise EmulatorError(f"truth file {path} line {before}: {doubt}")
         if has_rates:
             rates.append([math.radians(row[name]) for name in RATE_COLUMNS])
         elif len(times) > 1:

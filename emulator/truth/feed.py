@@ -142,7 +142,6 @@ class LiveFeed:
         return f"{protocol}:{address[0]}:{address[1]}"
 
     def receive(self, data: bytes) -> None:
-        """Process one received message."""
         if len(data) > self.truth.format.max_size:
             self.truth.reject(self._too_long())
             return

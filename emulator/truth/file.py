@@ -31,7 +31,6 @@ MAX_BYTES: Final = 500_000_000
 
 
 def read_truth_file(path: Path) -> FileTruth:
-    """Read a truth file."""
     text = _text("truth file", path)
     if is_ccsds(text):
         return read_aem(path, text)

@@ -2,7 +2,8 @@
 
 A position must not be inside the Earth. Above the atmosphere, a satellite has a hundredth of the speed of a circular
 orbit at least, which is that of an ellipse of eccentricity 0.9999 at its apogee; near the Earth it is at most as fast as
-a body that comes from far away with `EXCESS_M_S`, elsewhere as `FASTEST_M_S`. A date is near the date of the run, and
+a body that comes from far away with `EXCESS_M_S`, elsewhere as `FASTEST_M_S`. The same holds halfway between two rows of a
+file, where a wrong sign in one of them shows. A date is near the date of the run, and
 not that of the run on another epoch.
 """
 
@@ -13,7 +14,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Final
 
-from starhil.emulator.truth.orbit import EARTH_GM_M3_S2, OrbitState
+from starhil.emulator.truth.orbit import EARTH_GM_M3_S2, OrbitState, interpolate_orbit
 from starid.arithmetic.elementary import square
 from starid.arithmetic.matrices import length
 from starid.catalog.earth import DAY_S
@@ -57,6 +58,13 @@ def doubt_of_orbit(orbit: OrbitState) -> str:
     return next(
         _mistakes(distance, speed), f"{fault}: give metres and m/s relative to the Earth's centre, GCRS"
     )
+
+
+def doubt_between(before: OrbitState, after: OrbitState, length_s: float) -> str:
+    """Return why the orbit halfway between two rows cannot be right; an empty text if it can."""
+    halfway = interpolate_orbit(before, after, 0.5, length_s)
+    fault = _fault(length(halfway.position_m), length(halfway.velocity_m_s))
+    return fault and f"{fault}, halfway to the next row: a number is wrong, or the rows are too far apart"
 
 
 def doubt_of_date(unix_s: float, run_unix_s: float) -> str:

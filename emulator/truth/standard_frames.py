@@ -17,7 +17,7 @@ import numpy as np
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.feed_rates import FeedError, FeedRates
 from starhil.emulator.truth.orbit import OrbitState
-from starhil.emulator.truth.plausibility import doubt_of_orbit
+from starhil.emulator.truth.plausibility import doubt_between, doubt_of_orbit
 from starhil.emulator.truth.source import Vector
 from starhil.emulator.truth.table import FileTruth, OrbitTable, Span
 from starhil.protocol.icd.conventions import NANOSECONDS
@@ -159,7 +159,13 @@ def orbit_of_rows(path: Path, frame: Rotation, blocks: Sequence[Block[Sequence[f
         doubt = doubt_of_orbit(state)
         if doubt:
             raise EmulatorError(f"orbit file {path}: {doubt}")
-    return OrbitTable(path, times, states, _spans(blocks, spans_ns))
+    spans = _spans(blocks, spans_ns)
+    for span in spans:
+        for row in range(span.first, span.last):
+            doubt = doubt_between(states[row], states[row + 1], float(times[row + 1] - times[row]))
+            if doubt:
+                raise EmulatorError(f"orbit file {path}: row {row + 1}: {doubt}")
+    return OrbitTable(path, times, states, spans)
 
 
 def _spans_ns(blocks: Sequence[Block[Any]]) -> list[tuple[int, int]]:

@@ -38,7 +38,6 @@ BOUNDARIES: Final = "segmentboundarytimes"
 
 
 def read_attitude(path: Path, text: str) -> FileTruth:
-    """Read an attitude file."""
     return attitudes_of(path, _read(f"truth file {path}", text, "Attitude"))
 
 

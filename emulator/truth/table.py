@@ -39,7 +39,6 @@ class Span:
 
     @property
     def rows(self) -> slice:
-        """Its rows."""
         return slice(self.first, self.last + 1)
 
 

@@ -74,7 +74,6 @@ class Truth:
         self._host = host
 
     async def open(self) -> None:
-        """Build the configured truth."""
         self.put(*await self._load(self.configured, None))
 
     async def set(self, config: TruthConfig, at_s: float | None = None) -> None:
@@ -164,7 +163,6 @@ class SensorTruth:
 
     @property
     def kind(self) -> str:
-        """Kind of the truth source of the body."""
         return self._body.source.kind
 
     def state(self, t_s: float) -> TruthState:

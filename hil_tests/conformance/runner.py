@@ -71,21 +71,21 @@ def select_cases(
 
     Raises BenchError: a pattern matches no case, or none of its cases is left.
     """
-    known = list(cases)
+    items = list(cases)
     selected: set[str] = set()
     for pattern in patterns or ("*",):
-        found = [item for item in known if _matches(item.id, pattern)]
-        if not found:
-            areas = ", ".join(sorted({item.area for item in known}))
+        matches = [item for item in items if _matches(item.id, pattern)]
+        if not matches:
+            areas = ", ".join(sorted({item.area for item in items}))
             raise BenchError(f"no conformance case matches '{pattern}'; areas: {areas}")
-        safe = [item for item in found if not item.intrusive]
+        safe = [item for item in matches if not item.intrusive]
         if safe_only and not safe:
             raise BenchError(
-                f"no conformance case that matches '{pattern}' is left: --safe-only leaves out all {len(found)}, which change "
+                f"no conformance case that matches '{pattern}' is left: --safe-only leaves out all {len(matches)}, which change "
                 "the device"
             )
-        selected.update(item.id for item in (safe if safe_only else found))
-    return [item for item in known if item.id in selected]
+        selected.update(item.id for item in (safe if safe_only else matches))
+    return [item for item in items if item.id in selected]
 
 
 def _matches(case_id: str, pattern: str) -> bool:

@@ -205,12 +205,12 @@ def _expect_text_refused(probe: SerialProbe) -> None:
 
 def _texts(rows: list[Row]) -> Iterator[Case[SerialProbe]]:
     """Yield the cases of requests that are texts: each as it is defined, and no other."""
-    known = {row.request for row in rows}
+    requests = {row.request for row in rows}
 
     def others(text: str) -> list[str]:
         letter = "x" if text[-1] != "x" else "y"
         wrong = (text[:-1] + letter, letter + text[1:], text + letter, text[:-1], text.swapcase())
-        return [other for other in wrong if other.strip() and other not in known]
+        return [other for other in wrong if other.strip() and other not in requests]
 
     def refused(row: Row) -> Run:
         def run(probe: SerialProbe) -> None:

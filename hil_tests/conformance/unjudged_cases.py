@@ -56,11 +56,11 @@ def _kind(unit: Unit, item: Field) -> str:
 def _listed(kind: str, fields: list[str], probe: Probe) -> None:
     probe.log += [f"not judged: {name}" for name in fields]
     names = ", ".join(fields[:NAMED_FIELDS])
-    found = names if len(fields) <= NAMED_FIELDS else f"{len(fields)} fields, such as {names}"
+    listed = names if len(fields) <= NAMED_FIELDS else f"{len(fields)} fields, such as {names}"
     remedy = "a file *_cases.py beside the definition can judge them" + (
         "; an attitude is judged in quantities attitude.…" if kind == PLUGIN else ""
     )
-    raise CaseSkipped(f"{found}; {remedy}")
+    raise CaseSkipped(f"{listed}; {remedy}")
 
 
 def _judged(unit: Unit, row: Row) -> Iterator[Field]:

@@ -66,7 +66,6 @@ class Motion:
         return cls(start_s, attitude, (x, y, z))
 
     def at(self, t_s: float) -> Quaternion:
-        """Return the attitude at a time."""
         turned = from_rotation_vector([-rate * (t_s - self.start_s) for rate in self.rate_rad_s])
         return product(turned, self.attitude)
 
@@ -109,7 +108,6 @@ class AttitudeJudge:
         self._periods: list[tuple[float, float]] = []
 
     def started(self, now_s: float) -> None:
-        """The unit has started."""
         self._periods = [(now_s, self._period_s())]
 
     def retimed(self, now_s: float) -> None:

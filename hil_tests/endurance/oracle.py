@@ -121,7 +121,6 @@ class Oracle:
         self.attitudes.started(at_s)
 
     def time_passed(self, now_s: float) -> None:
-        """Simulation time has passed."""
         self.now_s = now_s
         if "boot" in self.modes:
             start = self.values.get("start_mode")

@@ -154,12 +154,10 @@ class Entry:
 
     @property
     def mapping(self) -> int:
-        """Mapping entry of a PDO."""
         return self.index << 16 | self.subindex << 8 | 8 * self.size
 
 
 def entries(unit: Unit, layout: Any) -> Iterator[Entry]:
-    """Yield the entries of the application."""
     for placed in layout.object:
         index, at = placed.index, f"{placed.index:04x}"
         command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]

@@ -110,7 +110,6 @@ class Unit:
 
     @cached_property
     def parameters_by_id(self) -> Mapping[int, Parameter]:
-        """Parameters that the unit exposes, by ID."""
         return {item.id: item for item in self.parameters.values()}
 
     @cached_property
@@ -135,7 +134,6 @@ class Unit:
         return any(row.id == row_id for row in self.telemetry.values())
 
     def serial_answers(self, row: Row) -> Sequence[str]:
-        """Return the answers of a row on the serial line."""
         return () if row.name in self.unanswered else row.answers
 
     @cached_property
@@ -172,7 +170,6 @@ class Unit:
         return Request(row.id, data, row.message_class, row.is_telemetry)
 
     def code(self, error: str) -> int:
-        """Return the unit's number for an error."""
         if not self.errors:
             return PUBLISHED.index(error)
         return self.errors.get(error, self.errors.get("other", PUBLISHED.index(error)))

@@ -320,7 +320,6 @@ class Row:
 
     @property
     def is_telemetry(self) -> bool:
-        """Whether the row is telemetry."""
         return self.kind == "telemetry"
 
     @property

@@ -475,7 +475,6 @@ class Dialect:
         self.names_rows = dialect != "b"
 
     def body(self, request: Request) -> bytes:
-        """Return ID and data."""
         return bytes((request.id,)) + request.data
 
     def data_sizes(self, message_class: str) -> range:  # noqa: ARG002 -- of all
@@ -487,15 +486,12 @@ class Dialect:
         return None
 
     def can_refuse(self, message_class: str) -> bool:  # noqa: ARG002 -- in all
-        """Return True."""
         return True
 
     def marks_unsolicited(self, message_class: str) -> bool:  # noqa: ARG002 -- in all that have it
-        """Return True."""
         return True
 
     def answer(self, taken: Taken, pending: Request | None) -> Answer:
-        """Return the answer in a message of the unit's dialect."""
         body = taken.body
         row = None if pending is None else self._unit.row(pending)
         as_requested = self._dialect == "b" and row is not None and row.is_telemetry and row.size == len(body)

@@ -84,7 +84,6 @@ NonNegative = Annotated[float, Field(ge=0.0)]
 
 
 def resolve(value: Operand, variables: Mapping[str, Value]) -> Value:
-    """Return the current value of an operand."""
     return variables[value.name] if isinstance(value, Variable) else value
 
 
@@ -265,7 +264,6 @@ def show_angle(arcsec: float) -> str:
 
 
 def describe(attitude: Quaternion) -> str:
-    """Format an attitude."""
     ra_deg, dec_deg, roll_deg = to_radec_roll(attitude)
     return f"RA {ra_deg:.4f}, Dec {dec_deg:.4f}, roll {roll_deg:.4f} deg"
 

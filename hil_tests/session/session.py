@@ -23,6 +23,7 @@ def run_steps(
     rig: Rig,
     folder: Path,
     *,
+    on_begin: Callable[[int, str], object] = lambda _number, _name: None,
     on_result: Callable[[StepResult], None] = lambda _result: None,
     truth_path: Path | None = None,
 ) -> SessionResult:
@@ -54,6 +55,7 @@ def run_steps(
 
     try:
         for number, step, link in planned:
+            on_begin(number, step.name)
             record(_run_step(session, number, step, link))
             if results[-1].status == FAILED and not script.defaults.keep_going:
                 break

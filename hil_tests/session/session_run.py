@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from rich.console import Console
+from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
 from starhil.hil_tests.attitude import attitude_error, unit
@@ -103,7 +104,8 @@ def run_session(request: SessionRequest) -> SessionResult:
             if request.control is not None:
                 _check_emulator(path, script, rig, folder)
             show = _shown_on_console(request.view, script, rig, stack, show)
-            result = run_steps(script, rig, folder, on_result=show, truth_path=request.truth)
+            begun = stack.enter_context(_running_step(console))
+            result = run_steps(script, rig, folder, on_begin=begun, on_result=show, truth_path=request.truth)
         if all(step.status == SKIPPED for step in result.results) and result.interruption is None:
             result = _failed(result, "at least one step runs", "every step is skipped", show)
     except EmulatorProcessError as error:
@@ -132,7 +134,6 @@ def _asks_for_an_emulator(script: Script) -> bool:
 
 
 def start_command(script: Script, folder: Path) -> str:
-    """Return the command that starts an emulator for a script."""
     emulator = script.emulator
     settings = pointed(script.truth.attitude, emulator.settings)
     words = ["starhil", "run", *([emulator.profile] if emulator.profile else [])]
@@ -283,6 +284,21 @@ def _emulator(
             extra=extra,
         )
     )
+
+
+@contextmanager
+def _running_step(console: Console) -> Iterator[Callable[[int, str], None]]:
+    """Show the running step and how long it has run, below the results, where the console is a terminal."""
+    columns = TextColumn("{task.description}", markup=False), TimeElapsedColumn()
+    with Progress(
+        *columns, console=console, disable=not console.is_terminal, transient=True, refresh_per_second=2
+    ) as lines:
+        task = lines.add_task("", total=None)
+
+        def begun(number: int, name: str) -> None:
+            lines.reset(task, description=f"… {number:3d}  {escape_controls(name)}")
+
+        yield begun
 
 
 def _print_result(console: Console, result: StepResult) -> None:

@@ -37,6 +37,7 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.values import Value
+from starid.storage.files import check_links
 
 CLOCK_GRAIN_S: Final = 1e-6
 
@@ -66,7 +67,6 @@ class Command(RequestStep):
                     yield f"with: {self.row.name}.{name}: {error}"
 
     def run(self, session: SessionState, link: str) -> Attempt:
-        """Send the telecommand."""
         data = self.raw
         if data is None:
             variables = session.variables
@@ -82,7 +82,6 @@ class ReadingStep(Step):
 
     @property
     def reading(self) -> Row | None:
-        """The row that the step reads."""
         return self.row
 
 
@@ -93,7 +92,6 @@ class Read(ReadingStep, RequestStep):
     row: Readable = Field(alias="read")
 
     def run(self, session: SessionState, link: str) -> Attempt:
-        """Read the row."""
         attempt, reading = self.exchange(session.rig.client(link).read, self.row.name)
         return attempt if reading is None or attempt.problem else self.judged(session, reading)
 
@@ -159,6 +157,7 @@ class Sample(ReadingStep):
         problems: list[str] = []
         last = Attempt()
         begin = time.monotonic()
+        check_links(session.folder / name)
         with (session.folder / name).open("w", newline="", encoding="utf-8", buffering=1) as stream:
             writer = csv.writer(stream)
             writer.writerow(["obc_time_s", "latency_ms", *fields])
@@ -237,7 +236,6 @@ class GetParameter(Step):
 
     @property
     def reading(self) -> Row | None:
-        """The row that the step reads."""
         return self._row
 
     def _problems(self, info: ValidationInfo) -> Iterator[str]:
@@ -245,7 +243,6 @@ class GetParameter(Step):
         yield from super()._problems(info)
 
     def run(self, session: SessionState, link: str) -> Attempt:
-        """Read the parameter."""
         return self.judged(session, session.rig.client(link).read_parameter(self.parameter.name))
 
 
@@ -317,7 +314,6 @@ class Wait(Step):
     seconds: Duration = Field(alias="wait_s")
 
     def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- any session, no link
-        """Wait."""
         time.sleep(self.seconds)
         return Attempt()
 
@@ -331,7 +327,6 @@ class Restart(Step):
     signal: Literal["term", "kill"] = Field(alias="restart")
 
     def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- no link
-        """Restart the emulator."""
         session.rig.restart(self.signal)
         return Attempt(detail="ready again")
 
@@ -346,7 +341,6 @@ class Control(Step):
     keys: Annotated[dict[str, Any], AfterValidator(check_json)] = Field({}, alias="with")
 
     def run(self, session: SessionState, link: str) -> Attempt:  # noqa: ARG002 -- no link
-        """Send the request."""
         return Attempt(detail=in_words(session.rig.control(self.action, self.keys)))
 
 

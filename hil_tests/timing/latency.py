@@ -135,7 +135,6 @@ class Echo:
         self._arrived: asyncio.Queue[float] = asyncio.Queue()
 
     async def start(self) -> None:
-        """Start the process."""
         await self._line.start(lambda _data: self._arrived.put_nowait(time.perf_counter()))
         self._process = subprocess.Popen([sys.executable, "-P", "-c", ECHO, self._line.description])  # noqa: S603
         await self._arrived.get()
@@ -153,7 +152,6 @@ class Echo:
             return inf
 
     async def close(self) -> None:
-        """End the process."""
         self._process.kill()
         self._process.wait()
         await self._line.close()
@@ -167,7 +165,6 @@ class Viewers:
         self._processes = [subprocess.Popen(command) for _ in range(count)]  # noqa: S603
 
     def close(self) -> None:
-        """End them."""
         for process in self._processes:
             process.kill()
             process.wait()

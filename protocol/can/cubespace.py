@@ -103,7 +103,6 @@ _REPLY_KINDS: Final[Mapping[int, ReplyKind]] = {
 
 
 def nack_type(row_id: int) -> MessageType:
-    """Return the type of the refusal of a row."""
     telemetry = RequestKind.of(row_id) is RequestKind.TELEMETRY
     return MessageType.TELEMETRY_NACK if telemetry else MessageType.TELECOMMAND_NACK
 

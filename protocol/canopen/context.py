@@ -71,7 +71,6 @@ class Context:
         self.frames.append(CanFrame(cob_id, data, extended=False))
 
     def report(self, kind: EventKind, value: float = 0, detail: str = "") -> None:
-        """Report an event to the application."""
         self.events.append(SlaveEvent(kind, self.now, value, detail))
 
     @property

@@ -46,7 +46,6 @@ class Entry:
 
     @property
     def key(self) -> tuple[int, int]:
-        """Index and sub-index."""
         return self.variable.index, self.variable.subindex
 
     @property

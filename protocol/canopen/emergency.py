@@ -111,7 +111,6 @@ class EmergencyProducer:
     def communication_error(
         self, code: EmergencyCode, data: bytes = b"", *, key: bytes = b"", active: bool = True
     ) -> None:
-        """Report an error of communication, or that it is cleared."""
         if active:
             self.raise_error(code, ErrorRegister.COMMUNICATION, data, key=key)
         else:

@@ -124,7 +124,6 @@ class TransmitPdo(Pdo):
 
     @property
     def active(self) -> bool:
-        """Whether the PDO may be sent."""
         return self.exists and self._context.state is NmtState.OPERATIONAL
 
     @property
@@ -255,6 +254,5 @@ class PdoService:
             receiving.synchronise()
 
     def tick(self) -> None:
-        """Act on the timers."""
         for pdo in self._all:
             pdo.tick()

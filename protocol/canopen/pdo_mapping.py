@@ -123,7 +123,6 @@ class Pdo:
 
     @property
     def can_id(self) -> int:
-        """CAN ID of the message."""
         return self._cob_id.number() & ID_MASK
 
     @property

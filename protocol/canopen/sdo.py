@@ -44,7 +44,6 @@ class SdoServer:
 
     @property
     def busy(self) -> bool:
-        """Whether a transfer is active."""
         return self._transfer is not None
 
     def reset(self) -> None:

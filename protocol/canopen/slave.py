@@ -107,7 +107,6 @@ class CanopenSlave:
 
     @property
     def state(self) -> NmtState:
-        """NMT state."""
         return self._context.state
 
     @property

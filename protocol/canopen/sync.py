@@ -40,7 +40,6 @@ class SyncService:
 
     @property
     def can_id(self) -> int:
-        """CAN ID of the SYNC message."""
         return self._cob_id.number() & ID_MASK
 
     def configure(self) -> None:

@@ -119,7 +119,6 @@ def field_cells(row: Row) -> Iterator[tuple[str, ...]]:
 
 
 def parameter_cells(parameter: Parameter) -> list[str]:
-    """Cells of a parameter under PARAMETER_COLUMNS."""
     limits = f"{number(parameter.minimum)} to {number(parameter.maximum)}"
     if parameter.enum is not None:
         limits = enum_text(parameter.enum)
@@ -143,7 +142,6 @@ def enum_text(enum: EnumDefinition) -> str:
 
 
 def reference(icd: InterfaceDefinition) -> Iterator[Section]:
-    """The parameters and the enumerations."""
     parameters = [parameter_cells(parameter) for parameter in icd.parameters.values()]
     yield Section(heading="Parameters", columns=PARAMETER_COLUMNS, rows=parameters)
     enums = [[enum.name, enum_text(enum), enum.doc] for enum in icd.enums.values()]

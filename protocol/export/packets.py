@@ -59,7 +59,6 @@ def row_key(classes: Mapping[str, MessageClass], message_class: str, row_id: int
 
 
 def key_of(icd: InterfaceDefinition, row: Row) -> int:
-    """Return the key of a row of a definition."""
     return row_key(icd.classes_by_name, row.message_class, row.id)
 
 

@@ -26,7 +26,6 @@ from starhil.protocol.messages import ErrorCode
 
 
 def texts_of(table: str) -> dict[str, Any]:
-    """Return a table of the texts."""
     texts: dict[str, Any] = _texts()[table]
     return texts
 

@@ -43,7 +43,6 @@ def not_found(kind: Kind, name: str | Path) -> str:
 
 
 def bundled_units() -> list[str]:
-    """Return the names of the bundled units."""
     return list(bundled("unit"))
 
 

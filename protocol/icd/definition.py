@@ -87,15 +87,15 @@ class InterfaceDefinition:
 
     def with_rows(self, names: Iterable[str]) -> InterfaceDefinition:
         """Return the definition with only some of its rows: the telecommand, the telemetry or both of each name."""
-        chosen = dict.fromkeys(names)
-        for name in chosen:
+        names_once = dict.fromkeys(names)
+        for name in names_once:
             if name not in self.telecommands:
                 self.telemetry[name]  # an unknown one raises the error with suggestions
         telecommands = Names(
-            "telecommand", ((name, row) for name, row in self.telecommands.items() if name in chosen)
+            "telecommand", ((name, row) for name, row in self.telecommands.items() if name in names_once)
         )
         telemetry = Names(
-            "telemetry row", ((name, row) for name, row in self.telemetry.items() if name in chosen)
+            "telemetry row", ((name, row) for name, row in self.telemetry.items() if name in names_once)
         )
         return replace(self, telecommands=telecommands, telemetry=telemetry)
 

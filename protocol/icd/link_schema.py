@@ -51,12 +51,10 @@ class MessageClass(DefinitionModel):
 
     @property
     def reply_code(self) -> int | None:
-        """Code in a reply."""
         return self.code if self.reply is None else self.reply
 
     @property
     def unsolicited_code(self) -> int | None:
-        """Code in unsolicited telemetry."""
         return self.reply_code if self.unsolicited is None else self.unsolicited
 
 
@@ -345,7 +343,6 @@ class HeaderFieldModel(DefinitionModel):
         return {part.role: part for part in parts if part.role}
 
     def in_class(self, message_class: str) -> bool:
-        """Return whether messages of a class have this field."""
         return self.classes is None or message_class in self.classes
 
 

@@ -142,7 +142,6 @@ class Formats:
             starts[start] = form
 
     def of(self, message_class: str) -> MessageFormat:
-        """Return the format of the messages of a class."""
         return next((form for form in self.all if message_class in form.classes), self.other)
 
     def deframer(

@@ -84,7 +84,6 @@ class HeaderCodec:
         )
 
     def size(self, message_class: str) -> int:
-        """Return the size of the header in messages of a class."""
         size = self._sizes.get(message_class)
         if size is None:
             size = self._sizes[message_class] = sum(

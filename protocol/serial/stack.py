@@ -235,7 +235,6 @@ class SerialStack:
         )
 
     def device(self) -> Deframer[Request]:
-        """Return a receiver for the device's end."""
         return self.request_formats.deframer(
             self._request_of, self._request_size, self.max_size, self.link.timeout
         )
@@ -520,7 +519,6 @@ def _class_of(envelope: HeaderContent, row_id: int, pending: Request | None) -> 
 
 
 def dialects_of(link: SerialLinkModel | None) -> tuple[Dialect, ...]:
-    """Return the dialects of replies of a link."""
     if link is None or not isinstance(link.framing, CubeSpaceFraming):
         return ()
     return tuple(Dialect) if link.framing.dialect is None else (Dialect(link.framing.dialect),)

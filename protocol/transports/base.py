@@ -155,7 +155,6 @@ class ReconnectingTransport(Transport[Item]):
             return
 
     async def close(self) -> None:
-        """Close the port."""
         self._closing = True
         if self._reconnection is not None:
             self._reconnection.cancel()

@@ -36,7 +36,6 @@ _FORMS: Final = "auto, a kernel interface (vcan0), socketcand:HOST:PORT/BUS, vir
 
 
 def kernel_can_is_up(name: str) -> bool:
-    """Return whether the kernel has CAN and this interface is up."""
     family = getattr(socket, "AF_CAN", None)
     if family is None:
         return False

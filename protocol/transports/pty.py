@@ -81,7 +81,6 @@ class PtyPeers:
         self._present = self.present
 
     def close(self) -> None:
-        """Close the descriptors."""
         self._wake.close()
         if self._events >= 0:
             os.close(self._events)

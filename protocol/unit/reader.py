@@ -261,7 +261,6 @@ class _Reader:
         return Plugin(skipped=name)  # also if it fails: its names are unknown, not wrong
 
     def definition(self) -> InterfaceDefinition:
-        """Return what is valid of the definition."""
         icd = self._icd
         for file, item in self._tables["enum"]:
             with self._recording(f"{file}: enum {item.name}"):

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final, TextIO, TypeAlias
 
 from starid.errors import StaridError
+from starid.storage.files import check_links, is_stdout
 
 Column: TypeAlias = tuple[str, Callable[[Any], str]]
 """Heading of a column, and the function that formats a row for it."""
@@ -54,10 +55,16 @@ def prepare_output(path: Path, option: str) -> Path:
     Raises
     ------
     StaridError
-        The folder cannot be created, or the path is a folder.
+        The folder cannot be created, or the path is a folder, or a link of another user.
     """
     if path.is_dir():
         raise StaridError(f"{path}: is a folder; name a file with {option}")
+    try:
+        check_links(path)
+    except PermissionError as error:
+        raise StaridError(
+            f"{path}: cannot be written ({error.strerror}); choose another file with {option}"
+        ) from None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -87,8 +94,6 @@ def prepare_folder(path: Path, option: str) -> None:
 
 def report_stream(output: Path | None) -> TextIO:
     """Return the stream for the report of a command: stderr if its output file is stdout, or else stdout."""
-    from starid.storage.files import is_stdout
-
     return sys.stderr if output is not None and is_stdout(output) else sys.stdout
 
 

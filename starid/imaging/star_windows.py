@@ -72,18 +72,18 @@ def detect_near(
         tiles[row[number], :, column[number]] = image[y : y + TILE_PX, x : x + TILE_PX]
     quiet = dataclasses.replace(settings, follow_trails=False, block_px=BLOCK_PX)
     mosaic = tiles.reshape(rows * TILE_PX, columns * TILE_PX)
-    found = detect(mosaic, quiet)
-    at = np.clip(np.floor((found.xy_px + 0.5) / TILE_PX).astype(np.int64), 0, (columns - 1, rows - 1))
+    detections = detect(mosaic, quiet)
+    at = np.clip(np.floor((detections.xy_px + 0.5) / TILE_PX).astype(np.int64), 0, (columns - 1, rows - 1))
     tile = at[:, 1] * columns + at[:, 0]
     first = tile < used.size
     tile = np.where(first, tile, 0)
-    xy = found.xy_px - TILE_PX * at + corners[tile]
+    xy = detections.xy_px - TILE_PX * at + corners[tile]
     distance = lengths(xy - places[used][tile])
     around = first & (distance <= MAX_RADIUS_PX)
     off = xy[:, None, :] - places[None, :, :]
     elsewhere = around & ~(np.sum(square(off), axis=2) <= radius_px * radius_px).any(axis=1)
     uneven = _uneven_tiles(mosaic, (rows, columns))[tile]
-    alike = (found.flux >= _RIVAL_SHARE * found.flux[:, None]) & (uneven == uneven[:, None])
+    alike = (detections.flux >= _RIVAL_SHARE * detections.flux[:, None]) & (uneven == uneven[:, None])
     count = np.count_nonzero(elsewhere & alike, axis=1)
     rivals = count / (np.pi * (square(MAX_RADIUS_PX) - square(radius_px)))
     near = np.flatnonzero(around & (distance <= radius_px))
@@ -91,7 +91,7 @@ def detect_near(
     pixel = np.rint(xy[near]).astype(np.int64)
     _, once = np.unique(pixel[:, 1] * width + pixel[:, 0], return_index=True)
     kept = np.sort(near[once])
-    return _chosen(found, xy, kept), rivals[kept]
+    return _chosen(detections, xy, kept), rivals[kept]
 
 
 def _uneven_tiles(mosaic: GreyImage, shape: tuple[int, int]) -> Mask:
@@ -102,12 +102,12 @@ def _uneven_tiles(mosaic: GreyImage, shape: tuple[int, int]) -> Mask:
     return np.asarray((np.ptp(quarters, axis=(1, 3)) > _UNEVEN_SIGMA * noise).ravel())
 
 
-def _chosen(found: Detections, xy: Array, kept: Indices) -> Detections:
+def _chosen(detections: Detections, xy: Array, kept: Indices) -> Detections:
     return dataclasses.replace(
-        found,
+        detections,
         xy_px=xy[kept],
         **{
-            name: getattr(found, name)[kept]
+            name: getattr(detections, name)[kept]
             for name in ("flux", "flux_sigma", "xy_sigma_px", "correlation", "saturated", "edge")
         },
     )

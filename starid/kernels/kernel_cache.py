@@ -23,9 +23,10 @@ import zlib
 from pathlib import Path
 from typing import Final
 
-from starid.storage.cache import KERNEL_SUFFIX, cache_dir, evict, kernel_folder, mark_used
+from starid.storage.cache import KERNEL_SUFFIX, cache_dir, evict, kernel_folder, make_kernel_folder, mark_used
 from starid.storage.files import write_atomically
 from starid.storage.temporary_folder import locked, make_temporary_folder
+from starid.storage.working_folder import check_working_folder
 
 _log = logging.getLogger(__name__)
 
@@ -38,6 +39,7 @@ _PATIENCE_S: Final = 5.0
 """Longest time for which a process waits until another one has recorded its checksums, seconds."""
 _ROOM_BYTES: Final = 40_000_000
 """Free space with which kernels are cached: they take 15 MB, and are written beside the old ones."""
+_PRIVATE: Final = 0o700
 _UNFINISHED_S: Final = 3600.0
 """Time after which a file without a checksum was left by a process that did not end properly, seconds."""
 
@@ -51,6 +53,7 @@ def use_kernel_cache() -> bool:
     Where the folder in the cache cannot be written, a copy of it in the temporary folder is used, which is removed at the
     end of the process; if that leaves kernels to be compiled, a warning is logged.
     """
+    check_working_folder()
     key = sources_key()
     folder = kernel_folder(key)
     try:
@@ -60,7 +63,7 @@ def use_kernel_cache() -> bool:
         if folder is None or (folder.exists() and not os.access(folder, os.W_OK | os.X_OK)):
             folder = _temporary_copy(folder or cache_dir() / key)
         else:
-            folder.mkdir(parents=True, exist_ok=True)
+            make_kernel_folder(folder)
             mark_used(folder)
             atexit.register(record_checksums, folder, time.time())
         remove_damaged(folder)
@@ -91,6 +94,7 @@ def _temporary_copy(folder: Path) -> Path:
     copy = make_temporary_folder("starhil-kernels-")
     if folder.is_dir():
         shutil.copytree(folder, copy, dirs_exist_ok=True)
+        copy.chmod(_PRIVATE)  # others may have entered the original
     else:
         _log.warning(
             "%s: kernels cannot be cached, so that each process compiles them; set STARHIL_CACHE_DIR to a folder that "

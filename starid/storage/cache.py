@@ -32,6 +32,7 @@ LIMIT_VARIABLE: Final = "STARHIL_CACHE_LIMIT_MB"
 DEFAULT_LIMIT_MB: Final = 500.0
 BYTES_PER_MB: Final = 1_000_000
 _PRIVATE: Final = 0o700
+_READABLE: Final = 0o755
 _KERNELS: Final = "kernels"
 KERNEL_SUFFIX: Final = ".nbc"
 _OWN_NAME: Final = re.compile(
@@ -113,18 +114,23 @@ def insecurity(folder: Path) -> str:
     ):  # no valid name, or a loop of links: nothing can be read there
         return ""
     for each in dict.fromkeys((path, resolved, *path.parents, *resolved.parents)):
-        try:
-            status = each.lstat()
-        except (OSError, ValueError):  # not made yet: what is above it decides
-            continue
-        if status.st_uid not in (_user(), 0):
-            return f"{each} belongs to user {status.st_uid}"
-        if stat.S_ISLNK(status.st_mode) or (each not in (path, resolved) and status.st_mode & stat.S_ISVTX):
-            continue
-        by_group = status.st_mode & stat.S_IWGRP and not _is_private_group(status.st_gid)
-        if by_group or status.st_mode & stat.S_IWOTH:
-            return f"others may write to {each}"
+        problem = _insecurity_of(each, may_be_sticky=each not in (path, resolved))
+        if problem:
+            return problem
     return ""
+
+
+def _insecurity_of(path: Path, *, may_be_sticky: bool = False) -> str:
+    """Return why others could change a file or folder, whatever is above it; empty if they cannot."""
+    try:
+        status = path.lstat()
+    except (OSError, ValueError):  # not made yet, or another process has removed it
+        return ""
+    if status.st_uid not in (_user(), 0):
+        return f"{path} belongs to user {status.st_uid}"
+    if stat.S_ISLNK(status.st_mode) or (may_be_sticky and status.st_mode & stat.S_ISVTX):
+        return ""
+    return f"others may write to {path}" if _writers(status.st_mode, status.st_gid) else ""
 
 
 def _is_private_group(group: int) -> bool:
@@ -164,7 +170,7 @@ def kernel_folder(key: str) -> Path | None:
     The folder need not exist yet.
     """
     folder = cache_dir() / _KERNELS / key
-    problem = insecurity(folder)
+    problem = insecurity(folder) or next(filter(None, map(_insecurity_of, _shared_content(folder))), "")
     if problem:
         _warn_not_used(folder, problem)
         return _folder_of_process() / _KERNELS / key
@@ -172,6 +178,47 @@ def kernel_folder(key: str) -> Path | None:
         return folder
     nearest = next(parent for parent in folder.parents if os.access(parent, os.F_OK))
     return folder if nearest.is_dir() and os.access(nearest, os.W_OK | os.X_OK) else None
+
+
+def make_kernel_folder(folder: Path) -> None:
+    """Make a folder for machine code, unless it exists; numba makes what is in it.
+
+    If the umask lets others write to new files, as in some containers, nobody else may enter the folder.
+
+    Raises
+    ------
+    OSError
+        It cannot be made.
+    """
+    folder.parent.parent.mkdir(parents=True, exist_ok=True)
+    folder.parent.mkdir(_READABLE, exist_ok=True)
+    folder.mkdir(_READABLE, exist_ok=True)
+    if _umask_lets_others_write():
+        folder.chmod(_PRIVATE)
+
+
+def _umask_lets_others_write() -> bool:
+    if sys.platform == "win32":
+        return False
+    umask = os.umask(0o777 & ~_PRIVATE)
+    os.umask(umask)
+    return bool(_writers(0o777 & ~umask, os.getegid()))
+
+
+def _writers(mode: int, group: int) -> int:
+    """Return the bits of a mode by which others may write."""
+    by_group = stat.S_IWGRP if mode & stat.S_IWGRP and not _is_private_group(group) else 0
+    return by_group | mode & stat.S_IWOTH
+
+
+def _shared_content(folder: Path) -> Iterator[Path]:
+    """Yield what is in a folder, unless nobody else may enter it."""
+    try:
+        shared = sys.platform != "win32" and folder.stat().st_mode & ~_PRIVATE & 0o777
+    except OSError:  # not made yet
+        return
+    if shared:
+        yield from folder.rglob("*")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Processes that this one starts through libraries, such as those of a pool."""
+"""Child processes started by libraries, such as those of a pool."""
 
 from __future__ import annotations
 

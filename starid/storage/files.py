@@ -27,6 +27,9 @@ _OPEN: Final = sum(getattr(os, name, 0) for name in ("O_RDONLY", "O_NONBLOCK", "
 STDOUT: Final = 1
 """File descriptor of standard output."""
 
+_MOST_LINKS: Final = 40
+"""Number of links that Linux follows one after the other."""
+
 _NUMBER: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 TEXT_LIMIT: Final = 10 * MEGABYTE
@@ -138,6 +141,26 @@ def open_stream(path: str | Path) -> BinaryIO:
     return os.fdopen(os.dup(STDOUT), "wb")
 
 
+def check_links(path: str | Path) -> None:
+    """Check that a file to write is not a link of another user, as in /tmp: it could lead to any file of this one.
+
+    Raises
+    ------
+    PermissionError
+        It is.
+    """
+    for _ in range(_MOST_LINKS):
+        try:
+            status = os.lstat(path)
+        except (OSError, ValueError):  # there is none, or it cannot be written either
+            return
+        if sys.platform == "win32" or not stat.S_ISLNK(status.st_mode):
+            return
+        if status.st_uid not in (os.geteuid(), 0):
+            raise PermissionError(errno.EPERM, f"a link that user {status.st_uid} has made", str(path))
+        path = Path(path).parent / Path(path).readlink()
+
+
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file by filling a temporary one and renaming it.
 
@@ -154,8 +177,9 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     Raises
     ------
     OSError
-        The folder cannot be written, or `path` is a folder itself.
+        The folder cannot be written, or `path` is a folder itself, or a link of another user.
     """
+    check_links(path)
     if is_stream(path):
         with tempfile.TemporaryDirectory() as folder:
             whole = Path(folder, path.name)

@@ -223,11 +223,11 @@ def setting_forgotten(
 def similar_texts(unit: SimulatedUnit) -> None:
     """Look at the first four letters of a request only."""
     stack = stack_of(unit)
-    known = {text[:4]: row for text, row in stack._by_text.items()}
+    row_by_text = {text[:4]: row for text, row in stack._by_text.items()}
 
     class Similar(dict[str, Row]):
         def get(self, text: str, default: Any = None) -> Any:
-            return known.get(text[:4], default)
+            return row_by_text.get(text[:4], default)
 
     stack._by_text = Similar()
 
@@ -265,9 +265,9 @@ def st200() -> Iterator[UnitMutant]:
     one, attitude, command = "framing.one", "attitude.record", "commands.set_keep_alive"
 
     def unstuffed(data: bytes) -> list[bytes]:
-        return [re.sub(rb"\xf0([\x00-\x0f])", lambda found: bytes((0xF0 | found[1][0],)), data)]
+        return [re.sub(rb"\xf0([\x00-\x0f])", lambda damages: bytes((0xF0 | damages[1][0],)), data)]
 
-    found: dict[str, tuple[str, Damage]] = {
+    damages: dict[str, tuple[str, Damage]] = {
         "the check is wrong": (one, bodies(lambda body, _stack: body[:-1] + bytes((body[-1] ^ 1,)), "record")),
         "no check is sent": (one, bodies(lambda body, _stack: body[:-1], "record")),
         "the check does not cover the start mark": (one, bodies(lambda body, stack: body[:-1] + stack.reply_formats.of("record").check.compute(body[:-1]), "record")),
@@ -284,7 +284,7 @@ def st200() -> Iterator[UnitMutant]:
         "ping is answered": ("commands.ping", handling(ping_answered)),
         "messages of any length are taken": ("framing.overlong", takes_any_length),
     }  # fmt: skip
-    for name, (caught_by, damage) in found.items():
+    for name, (caught_by, damage) in damages.items():
         yield UnitMutant("st200", name, f"serial.{caught_by}", damage)
 
 
@@ -415,7 +415,7 @@ def gen2(link: str = "serial") -> Iterator[UnitMutant]:
 
     one = "framing.one" if link == "serial" else "frames.telemetry"
     length, setting = "lengths.set_unix_time.long", "settings.unsolicited_telemetry"
-    found: dict[str, tuple[str, Damage]] = {
+    damages: dict[str, tuple[str, Damage]] = {
         "replies come twice": (one, outgoing(twice)),
         "replies are missing": ("recovery.flood", every_fifth_missing()),
         "the last byte of telemetry is missing": ("telemetry.identification", telemetry_data(lambda data, _row: data[:-1])),
@@ -426,13 +426,13 @@ def gen2(link: str = "serial") -> Iterator[UnitMutant]:
         "a setting is acknowledged and forgotten": (setting, only_acknowledged(112)),
     }  # fmt: skip
     if link == "serial":
-        found |= {
+        damages |= {
             "a stray byte follows each reply": ("framing.reply-form", outgoing(lambda data: [data + b"\x42"])),
             "replies carry another identifier": (one, replies(lambda reply, _device: dataclasses.replace(reply, id=(reply.id or 0) ^ 1))),
             "replies are not stuffed": (setting, outgoing(stuffing_missing)),
             "stuffed bytes of requests are changed": (setting, incoming(lambda data: [data.replace(b"\x1f\x1f", b"\x1e")])),
         }  # fmt: skip
-    for name, (caught_by, damage) in found.items():
+    for name, (caught_by, damage) in damages.items():
         yield UnitMutant("cubestar-gen2", name, f"{link}.{caught_by}", damage)
 
 

@@ -45,8 +45,8 @@ class ProtocolMutant:
 
 def read_mutants() -> list[ProtocolMutant]:
     """Return the mutants of the file."""
-    found = []
+    mutants = []
     for table in tomllib.loads(FILE.read_text(encoding="utf-8"))["mutant"]:
         edits, cases = tuple(Edit(**edit) for edit in table.pop("edits")), tuple(table.pop("cases"))
-        found.append(ProtocolMutant(**table, cases=cases, edits=edits))
-    return found
+        mutants.append(ProtocolMutant(**table, cases=cases, edits=edits))
+    return mutants

@@ -41,10 +41,10 @@ UNREADABLE = (
 
 
 @pytest.mark.parametrize(
-    ("mutant", "caught_by", "expected", "seen"), UNREADABLE, ids=lambda item: getattr(item, "name", "")
+    ("mutant", "caught_by", "expected", "words"), UNREADABLE, ids=lambda item: getattr(item, "name", "")
 )
 def test_frames_that_cannot_be_parsed_fail_their_cases_and_the_run_continues(
-    mutant, caught_by, expected, seen
+    mutant, caught_by, expected, words
 ):
     with mutant.planted():
         outcomes = run_cases(simulated_probe(), CANOPEN_CASES)
@@ -52,7 +52,7 @@ def test_frames_that_cannot_be_parsed_fail_their_cases_and_the_run_continues(
     caught = next(outcome for outcome in outcomes if outcome.id == caught_by)
     assert caught.status == "failed"
     assert caught.expected.startswith(expected)
-    assert seen in caught.seen
+    assert words in caught.seen
 
 
 def lost(*_arguments: object) -> None:

@@ -11,7 +11,7 @@ from tests.emulator.cli.command_line import run_command_line
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("garbage", "not a valid EDS: File contains no section headers"),
         ("[a]\n[a]\n", "not a valid EDS: While reading from"),
@@ -20,7 +20,7 @@ from tests.emulator.cli.command_line import run_command_line
     ],
     ids=["no section", "section twice", "no name", "long line"],
 )
-def test_an_eds_that_is_none_is_rejected_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+def test_an_eds_that_is_none_is_rejected_in_one_line(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "unit.eds"
     path.write_text(text)
     begin_s = time.process_time()
@@ -29,7 +29,7 @@ def test_an_eds_that_is_none_is_rejected_in_one_line(tmp_path: Path, text: str, 
     )
     assert time.process_time() - begin_s < 5.0
     assert status == 2
-    assert said in errors
+    assert message in errors
     assert errors.count("\n") == 1
 
 

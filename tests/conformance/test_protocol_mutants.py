@@ -80,25 +80,25 @@ def messages(unit: Path) -> list[object]:
 
 
 def test_the_unit_of_the_tutorial_passes_every_case(tmp_path: Path) -> None:
-    found = list(outcomes(unit_of("tutorial", tmp_path / "lynx")))
+    results = list(outcomes(unit_of("tutorial", tmp_path / "lynx")))
     assert [
-        (o.id, o.expected, o.seen) for o in found if o.status != "passed" and ".unjudged." not in o.id
+        (o.id, o.expected, o.seen) for o in results if o.status != "passed" and ".unjudged." not in o.id
     ] == []
-    assert len(found) >= 45
+    assert len(results) >= 45
 
 
 def test_every_error_that_changes_a_message_of_the_tutorial_fails_a_case(tmp_path: Path) -> None:
     unit = written(tmp_path / "lynx")
     healthy = messages(unit)
-    missed, found = [], 0
+    missed, caught = [], 0
     for mutant in (mutant for mutant in MUTANTS if mutant.unit != "tutorial"):  # those have their cases above
         with mutant.planted():
             if messages(unit) != healthy:
-                found += 1
+                caught += 1
                 if all(outcome.status != "failed" for outcome in outcomes(unit)):
                     missed.append(mutant.name)
     assert missed == []
-    assert found >= 20
+    assert caught >= 20
 
 
 @pytest.mark.parametrize("link", LINKS)

@@ -48,7 +48,7 @@ MUTANTS = [
 def test_a_unit_that_differs_from_the_text_is_found(case, file, right, wrong, tmp_path: Path) -> None:
     folder = tmp_path / "st16"
     shutil.copytree(find_unit("st16"), folder, ignore=shutil.ignore_patterns("__pycache__"))
-    (found,) = [item for item in serial_suite(read_unit("st16")) if item.id == f"serial.{case}"]
+    (case_item,) = [item for item in serial_suite(read_unit("st16")) if item.id == f"serial.{case}"]
 
     def point(simulated: SimulatedUnit) -> None:
         simulated.device.surroundings.truth = FixedTruth(Attitude.from_quaternion(POINTING))
@@ -56,7 +56,7 @@ def test_a_unit_that_differs_from_the_text_is_found(case, file, right, wrong, tm
     def outcome():
         with SimulatedUnit("serial", point, unit=str(folder)) as simulated:
             simulated.probe.truth = lambda: POINTING
-            return run_case(simulated.probe, found)
+            return run_case(simulated.probe, case_item)
 
     right_one = outcome()
     assert right_one.status == "passed", (right_one.expected, right_one.seen)

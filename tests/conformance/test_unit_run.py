@@ -189,13 +189,13 @@ def test_settings_that_a_row_reports_among_other_values_are_restored(tmp_path):
         unit.probe.command(
             "set_numbers", a=33, b=-1.5, c=4, d=0.5, e=10.0, f=2.0, g=-3, h=0.5, i=7, flag=True, group=9
         )
-        found = unit.probe.telemetry("state")
+        first_state = unit.probe.telemetry("state")
         outcomes = run_cases(unit.probe, cases)
-        seen = unit.probe.telemetry("state")
+        last_state = unit.probe.telemetry("state")
         mode = unit.device.modes.mode.value
     assert [(o.id, o.expected, o.seen) for o in outcomes if o.status != "passed"] == []
     assert "serial.settings.state.set_numbers" in {o.id for o in outcomes}
-    assert {**seen, "uptime": 0} == {**found, "uptime": 0}
+    assert {**last_state, "uptime": 0} == {**first_state, "uptime": 0}
     assert mode == "tracking"
 
 

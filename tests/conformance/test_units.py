@@ -65,9 +65,9 @@ def test_a_bundled_unit_passes_every_case_of_its_definition(unit: str, link: str
         ("canopen", "oresat"),
     ],
 )
-@pytest.mark.parametrize("known", ["true", "conjugated"])
+@pytest.mark.parametrize("names", ["true", "conjugated"])
 def test_an_attitude_is_compared_with_the_truth_as_the_unit_reports_it(
-    link: str, unit: str, known: str
+    link: str, unit: str, names: str
 ) -> None:
     cases = [case for name, case in cases_of(unit, link).items() if name.startswith(f"{link}.attitude.")]
 
@@ -75,9 +75,9 @@ def test_an_attitude_is_compared_with_the_truth_as_the_unit_reports_it(
         simulated.device.surroundings.truth = FixedTruth(Attitude.from_quaternion(POINTING))
 
     with SimulatedUnit(link, point, unit=unit) as simulated:
-        simulated.probe.truth = lambda: POINTING if known == "true" else conjugate(POINTING)
+        simulated.probe.truth = lambda: POINTING if names == "true" else conjugate(POINTING)
         outcomes = run_cases(simulated.probe, cases)
-    assert {o.status for o in outcomes} == {"passed" if known == "true" else "failed"}, outcomes
+    assert {o.status for o in outcomes} == {"passed" if names == "true" else "failed"}, outcomes
 
 
 @pytest.mark.parametrize("mutant", list(mutants()), ids=lambda mutant: f"{mutant.unit}: {mutant.name}")

@@ -260,7 +260,7 @@ def worker(monkeypatch):
 
         def start(command, **options):
             program = waiting.pop(0) if len(waiting) > 1 else waiting[0]
-            started.append(real([command[0], "-c", program, command[-1]], **options))
+            started.append(real([command[0], "-c", program, *command[-2:]], **options))
             return started[-1]
 
         monkeypatch.setattr(worker_process.subprocess, "Popen", start)

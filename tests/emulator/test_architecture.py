@@ -59,12 +59,12 @@ def opened(make_bench, monkeypatch):
 
 
 def part_of(run, path):
-    found = run
+    part = run
     for name in path:
-        found = getattr(found, name)
-        found = next(iter(found.values())) if name == "links" else found
-        found = found[0] if isinstance(found, list) else found
-    return found
+        part = getattr(part, name)
+        part = next(iter(part.values())) if name == "links" else part
+        part = part[0] if isinstance(part, list) else part
+    return part
 
 
 def named(path, class_name, file):
@@ -77,13 +77,13 @@ def test_every_part_of_the_drawing_is_where_it_says(opened):
     def look(run):
         return [part_of(run, path) for path, _, _ in drawing()]
 
-    for (path, class_name, file), found in zip(drawing(), opened(look), strict=True):
-        wanted = named(path, class_name, file)
-        assert Path(inspect.getsourcefile(wanted)).resolve() == (ROOT / file).resolve()
-        if path and path[-1] in OPTIONAL and found is None:
+    for (path, class_name, file), part in zip(drawing(), opened(look), strict=True):
+        drawn = named(path, class_name, file)
+        assert Path(inspect.getsourcefile(drawn)).resolve() == (ROOT / file).resolve()
+        if path and path[-1] in OPTIONAL and part is None:
             continue
-        same_kind = type(found).__module__ == wanted.__module__ or type(found) is FakeImager
-        assert isinstance(found, wanted) or same_kind, path
+        same_kind = type(part).__module__ == drawn.__module__ or type(part) is FakeImager
+        assert isinstance(part, drawn) or same_kind, path
 
 
 def test_the_drawing_leaves_no_part_out(opened):

@@ -137,7 +137,7 @@ def test_a_peer_that_does_not_read_loses_its_connection(run, monkeypatch, server
     async def scenario(emulation, _line):
         address = emulation.ready_fields["control"]
         port = view_port(emulation) if server_ == "console" else int(address.rpartition(":")[2])
-        asked = {
+        questions = {
             "console": b"GET /static/vendor/uPlot.esm.js HTTP/1.1\r\nHost: x\r\n\r\n",
             "control channel": b'{"do": "status"}\n',
         }[server_]
@@ -149,7 +149,7 @@ def test_a_peer_that_does_not_read_loses_its_connection(run, monkeypatch, server
 
             async def ask_without_end():
                 while True:
-                    await loop.sock_sendall(peer, asked)
+                    await loop.sock_sendall(peer, questions)
 
             with pytest.raises(ConnectionError):  # once the server has closed
                 await asyncio.wait_for(ask_without_end(), PATIENCE_S)

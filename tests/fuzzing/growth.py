@@ -317,11 +317,11 @@ def pairs(channel: Channel) -> Iterator[tuple[str, bytes, bytes]]:
     "growth", lambda: [*WORST, *(bytes([channel, 0, 1, shape]) for channel in range(10) for shape in (0, 3))]
 )
 def _growth(_folder: Path) -> Run:
-    known = list(channels().values())
+    all_channels = list(channels().values())
 
     def run(data: bytes) -> None:
         numbers = [*data[:4], *bytes(4 - len(data[:4]))]
-        channel = known[numbers[0] % len(known)]
+        channel = all_channels[numbers[0] % len(all_channels)]
         message = channel.messages[numbers[1] % len(channel.messages)]
         small, large = (channel.grown(message, *numbers[2:], size) for size in (SMALL, LARGE))
         processed(channel, small)  # what is computed once

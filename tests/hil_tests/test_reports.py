@@ -44,10 +44,10 @@ def test_a_report_that_cannot_be_written_is_rejected_before_the_run(words, tmp_p
 
 
 def test_settings_are_those_of_the_emulator_that_conformance_starts(monkeypatch):
-    given = {}
+    arguments = {}
 
     def stop(**options):
-        given.update(options)
+        arguments.update(options)
         raise BenchError("enough")
 
     monkeypatch.setattr(conformance_run, "emulator_command", stop)
@@ -61,7 +61,7 @@ def test_settings_are_those_of_the_emulator_that_conformance_starts(monkeypatch)
         "parameters.update_rate=3",
     )
     assert str(run_command(*words, "--start").exception) == "enough"
-    assert given["settings"] == ["truth.kind=rate", "parameters.update_rate=3"]
+    assert arguments["settings"] == ["truth.kind=rate", "parameters.update_rate=3"]
     assert "--set needs --start" in str(run_command(*words[:2], "/dev/ttyX", *words[3:]).exception)
 
 

@@ -93,7 +93,7 @@ def requests_in(stream: bytes) -> list[tuple[int, bytes]]:
     the end, `1F 7F` the start of another message, and `1F` before anything else ends the message
     without effect, save that an identifier 1F may stand alone.
     """
-    found = []
+    values = []
     position = 0
     while (start := stream.find(b"\x1f\x7f", position)) >= 0:
         position = start + 2
@@ -104,7 +104,7 @@ def requests_in(stream: bytes) -> list[tuple[int, bytes]]:
                 body.append(byte)
                 position += 1
             elif position + 1 >= len(stream):
-                return found
+                return values
             else:
                 follower = stream[position + 1]
                 if follower == 0x1F:
@@ -114,7 +114,7 @@ def requests_in(stream: bytes) -> list[tuple[int, bytes]]:
                 elif follower == 0xFF:
                     position += 2
                     if body:
-                        found.append((body[0], bytes(body[1:])))
+                        values.append((body[0], bytes(body[1:])))
                     break
                 elif body:
                     position += 2
@@ -124,7 +124,7 @@ def requests_in(stream: bytes) -> list[tuple[int, bytes]]:
                 position += 2
             if len(body) > MAX_MESSAGE:
                 break
-    return found
+    return values
 
 
 def bodies_in(stream: bytes) -> list[bytes]:

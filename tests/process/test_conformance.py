@@ -60,13 +60,13 @@ AREAS = ("framing", "frames", "segments", "stuffing", "errors", "timing", "data"
 
 
 def test_areas_pass_on_pty_bus_and_canopen_and_are_reported(tmp_path):
-    chosen = [f"serial.{area}" for area in AREAS if area not in ("frames", "segments")]
-    chosen += [f"can.{area}" for area in AREAS if area not in ("framing", "stuffing")]
-    chosen += ["canopen.nmt", "canopen.sdo", "canopen.rpdo", "canopen.design"]
+    areas = [f"serial.{area}" for area in AREAS if area not in ("frames", "segments")]
+    areas += [f"can.{area}" for area in AREAS if area not in ("framing", "stuffing")]
+    areas += ["canopen.nmt", "canopen.sdo", "canopen.rpdo", "canopen.design"]
     junit, html = tmp_path / "c.xml", tmp_path / "c.html"
     links = ["--serial", "auto", "--can", "auto", "--canopen", "44"]
     how = ("--start", *links, *SLOW_MOTION, "--set", NO_IMAGES)
-    outcomes = conform(*chosen, *how, reports=("--junit", junit, "--html", html))
+    outcomes = conform(*areas, *how, reports=("--junit", junit, "--html", html))
     assert len(outcomes) >= 120
     assert int(ET.parse(junit).getroot().get("tests")) == len(outcomes)
     page = html.read_text()
@@ -76,7 +76,7 @@ def test_areas_pass_on_pty_bus_and_canopen_and_are_reported(tmp_path):
 
 def test_safe_cases_change_nothing(tmp_path):
     rows = ("device_status", "boot_status", "star_config")
-    chosen = ["serial.framing", "serial.telemetry", "serial.identifiers", "serial.timing", "serial.recovery"]
+    areas = ["serial.framing", "serial.telemetry", "serial.identifiers", "serial.timing", "serial.recovery"]
     command = emulator_command(
         seed=1, state_dir=tmp_path, settings=[NO_IMAGES], extra=["--clock", f"scaled:{SPEED}"]
     )
@@ -84,7 +84,7 @@ def test_safe_cases_change_nothing(tmp_path):
         port = emulator.ready["serial"]
         with ObcClient.open(serial=port, timeout_s=PATIENCE_S) as obc:
             before = {name: obc.telemetry(name) for name in rows}
-        outcomes = conform(*chosen, "--serial", port, "--safe-only", *SLOW_MOTION)
+        outcomes = conform(*areas, "--serial", port, "--safe-only", *SLOW_MOTION)
         with ObcClient.open(serial=port, timeout_s=PATIENCE_S) as obc:
             after = {name: obc.telemetry(name) for name in rows}
             last = obc.telemetry("acknowledge")["last_telecommand"]
@@ -118,11 +118,11 @@ def test_the_attitude_of_a_running_unit_is_compared_with_its_truth_log_or_a_stat
     )
     with EmulatorProcess(command) as emulator:
         words = ("serial.attitude", "--unit", "sagitta", "--serial", emulator.ready["serial"])
-        seen = [
+        frames = [
             run_cases((*words, *truth))[1] for truth in ((), ("--truth", log), ("--truth", "83.8,-1.2,30"))
         ]
     failed = ["serial.attitude.solution"] if wrong else []
-    assert seen == [[], failed, failed]
+    assert frames == [[], failed, failed]
 
 
 @pytest.mark.parametrize(

@@ -237,12 +237,12 @@ def children(process: int, word: str) -> list[int]:
 def replies(step: Callable[[np.void], object], port: str) -> list[dict[str, object]]:
     """What an OBC reads on the serial line while a simulator steps."""
     with ObcClient.open(serial=port, timeout_s=PATIENCE_S) as obc:
-        found = []
+        values = []
         for number, row in enumerate(tumble(6.0)):
             step(row)
             if number % 5 == 4:
-                found.append(obc.telemetry("precise_attitude") | obc.telemetry("device_status"))
-    return found
+                values.append(obc.telemetry("precise_attitude") | obc.telemetry("device_status"))
+    return values
 
 
 def test_an_obc_reads_the_same_as_beside_a_simulator_that_speaks_to_the_feed(
@@ -297,37 +297,37 @@ def test_it_connects_to_an_emulator_that_runs_and_leaves_it_running(fmu3: Path, 
 
 
 def test_reset_begins_again_with_the_same_outputs(fmu3: Path, tmp_path: Path) -> None:
-    seen = []
+    values = []
     with unit_of(fmu3, tmp_path) as unit:
         for _ in range(2):
             unit.begin()
             unit.time = 0.0
             for row in tumble(2.5):
                 unit.step(row)
-            seen.append([unit.get(name) for name in OUTPUTS])
+            values.append([unit.get(name) for name in OUTPUTS])
             unit.slave.reset()
             assert unit.get("frame") == 0
             unit.set("profile", str(fmu3.parent / QUICK))  # a parameter can be set again
             unit.set("serial", "off")
-    assert seen[0] == seen[1]
-    assert seen[0][OUTPUTS.index("valid")]
+    assert values[0] == values[1]
+    assert values[0][OUTPUTS.index("valid")]
 
 
 def test_signals_of_the_host_do_not_disturb_a_step(tumbling: tuple[Unit, Iterator[np.void]]) -> None:
     unit, motion = tumbling
-    seen = []
-    before = signal.signal(signal.SIGALRM, lambda number, _frame: seen.append(number))
+    values = []
+    before = signal.signal(signal.SIGALRM, lambda number, _frame: values.append(number))
     try:
         signal.setitimer(signal.ITIMER_REAL, 1e-3, 1e-3)
         for row in islice(motion, 100):
             unit.step(row)
-            if len(seen) > 20:  # Python handles those of a call as one, after it
+            if len(values) > 20:  # Python handles those of a call as one, after it
                 break
         assert unit.get("valid")
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
-    assert len(seen) > 20
+    assert len(values) > 20
 
 
 def test_an_emulator_that_dies_ends_the_step_with_a_message(fmu3: Path, tmp_path: Path) -> None:
@@ -373,7 +373,7 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("parameters", "said"),
+    ("parameters", "message"),
     [
         ({"command": "/does/not/exist"}, "/does/not/exist does not start: No such file"),
         ({"profile": "no_such_profile"}, "does not start: .*no_such_profile"),
@@ -384,13 +384,13 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
     ],
 )
 def test_what_does_not_start_says_why(
-    fmu3: Path, tmp_path: Path, parameters: dict[str, object], said: str
+    fmu3: Path, tmp_path: Path, parameters: dict[str, object], message: str
 ) -> None:
 
     with unit_of(fmu3, tmp_path, **parameters) as unit:
         with refused("fmi3ExitInitializationMode"):
             unit.begin()
-        assert re.search(said, unit.messages[-1])
+        assert re.search(message, unit.messages[-1])
 
 
 def test_the_process_rejects_the_values_of_another_version() -> None:
@@ -451,6 +451,24 @@ def test_during_a_simulation_only_inputs_are_set(tumbling: tuple[Unit, Iterator[
         assert unit.messages[-1].startswith(f"{name}: ")
         assert unit.get(name) == before
     unit.step(next(motion))
+
+
+def test_a_start_is_a_time_before_the_simulation(
+    tumbling: tuple[Unit, Iterator[np.void]], fmu3: Path, tmp_path: Path
+) -> None:
+    """A start that was given later moved the clock of the simulation."""
+    unit, motion = tumbling
+    unit.step(next(motion))
+    with refused("fmi3EnterInitializationMode"):
+        unit.slave.enterInitializationMode(startTime=1000.0)
+    assert unit.messages[-1].startswith("start at 1000 s: ")
+    assert unit.get("time") == pytest.approx(unit.time)
+    unit.step(next(motion))
+    with unit_of(fmu3, tmp_path) as other:
+        for start in (float("nan"), float("inf")):
+            with refused("fmi3EnterInitializationMode"):
+                other.slave.enterInitializationMode(startTime=start)
+        assert other.get("time") == 0.0
 
 
 def test_a_variable_of_another_type_and_an_output_are_refused(fmu3: Path, tmp_path: Path) -> None:

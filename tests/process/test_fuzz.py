@@ -67,13 +67,13 @@ def harmless_batch(rng: random.Random) -> tuple[bytes, list[tuple[int, bytes]]]:
 async def exchange(client: ObcClient, data: bytes, expected: int) -> bytes:
     """Send bytes and gather what comes back until it holds the expected number of replies."""
     link = client.core.link
-    seen = bytearray()
+    received = bytearray()
     arrived = asyncio.Event()
 
     def take(item: bytes) -> None:
-        seen.extend(item)
+        received.extend(item)
         # an end mark cannot stand in the data: every escape byte there is doubled
-        if bytes(seen).replace(b"\x1f\x1f", b"").count(b"\x1f\xff") >= expected:
+        if bytes(received).replace(b"\x1f\x1f", b"").count(b"\x1f\xff") >= expected:
             arrived.set()
 
     link.on_raw = take
@@ -83,7 +83,7 @@ async def exchange(client: ObcClient, data: bytes, expected: int) -> bytes:
             await arrived.wait()
     finally:
         link.on_raw = None
-    return bytes(seen)
+    return bytes(received)
 
 
 def test_random_byte_strings(serial_obc, emulator):

@@ -39,11 +39,11 @@ def descendants(pid: int) -> set[int]:
             except (FileNotFoundError, ProcessLookupError):
                 continue
             parents[int(folder.name)] = int(fields[1])
-    found, wave = set(), {pid}
+    family, wave = set(), {pid}
     while wave:
         wave = {child for child, parent in parents.items() if parent in wave}
-        found |= wave
-    return found
+        family |= wave
+    return family
 
 
 def alive(pid: int) -> bool:

@@ -31,17 +31,9 @@ def run_pytest(folder: Path, programs: str | dict[str, str], *options: str) -> s
     return done.stdout + done.stderr
 
 
-@pytest.fixture(scope="module")
-def unit(tmp_path_factory):
-    """Stands in for a real unit on a serial line."""
-    with EmulatorProcess(
-        emulator_command(profile="ideal", state_dir=tmp_path_factory.mktemp("unit"))
-    ) as unit:
-        yield unit
-
-
-def test_what_a_unit_on_a_serial_line_lacks_is_skipped_by_name(unit, tmp_path):
-    out = run_pytest(tmp_path, PAGE_TESTS, "--starhil-serial", unit.ready["serial"])
+def test_what_a_unit_on_a_serial_line_lacks_is_skipped_by_name(tmp_path):
+    with EmulatorProcess(emulator_command(profile="ideal", state_dir=tmp_path / "unit")) as unit:
+        out = run_pytest(tmp_path, PAGE_TESTS, "--starhil-serial", unit.ready["serial"])
     assert "1 passed, 4 skipped" in out
     assert "test_an_attitude_is_found PASSED" in out
     assert "--starhil-serial names a unit; give its bus with --starhil-can" in out

@@ -193,8 +193,8 @@ def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
 def test_bad_input_ends_with_one_line_and_status_2(text, words, message, tmp_path):
     script = tmp_path / "wrong.toml"
     script.write_text(text)
-    status, _, said = run_command_line("session", str(script), *words, "--log", str(tmp_path / "log"))
+    status, _, stderr = run_command_line("session", str(script), *words, "--log", str(tmp_path / "log"))
     assert status == 2
-    assert message in said
-    assert len(said.strip().splitlines()) == 1
-    assert said.startswith("starhil: ")
+    assert message in stderr
+    assert len(stderr.strip().splitlines()) == 1
+    assert stderr.startswith("starhil: ")

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -50,3 +53,29 @@ def test_the_processes_of_a_pool_import_nothing_from_the_working_directory(was_r
     words = ["endurance", "--unit", "nos3", "--lives", "2", "--steps", "1", "--jobs", "2", "--rendered", "0"]
     done = subprocess.run([installed_command(), *words], capture_output=True, text=True, check=False)
     assert (done.returncode, was_run.exists()) == (0, False), done.stderr
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to another user")
+@pytest.mark.parametrize("name", [".numba_config.yaml", "matplotlibrc"])
+def test_settings_of_libraries_that_another_user_has_put_there_are_not_obeyed(tmp_path, monkeypatch, name):
+    """With `chrome_trace`, numba replaced any file of the user by a trace."""
+    settings, precious = tmp_path / name, tmp_path / "precious"
+    settings.write_text(f"chrome_trace: {precious}\n")
+    precious.write_text("precious")
+    monkeypatch.chdir(tmp_path)
+    uses_numba = [sys.executable, "-P", "-c", "import starid.kernels.jit"]
+    commands = [
+        [installed_command(), "unit", "list"],
+        [str(Path(installed_command()).with_name("starid")), "--help"],
+    ]
+    os.chown(settings, 12345, 12345)
+    for command in [uses_numba, *commands]:
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 1
+        assert re.search(
+            rf"{re.escape(str(settings))}: belongs to user 12345, and \w+ would obey it", done.stderr
+        )
+        assert precious.read_text() == "precious"
+    for command in commands:
+        os.chown(settings, os.geteuid(), -1)
+        assert subprocess.run(command, capture_output=True, check=False).returncode == 0

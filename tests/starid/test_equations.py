@@ -36,11 +36,11 @@ def docstrings():
 
 @pytest.fixture(scope="module")
 def locations():
-    found = defaultdict(list)
+    places = defaultdict(list)
     for location, text in docstrings():
         for number in NUMBER.findall(text):
-            found[number].append(location)
-    return found
+            places[number].append(location)
+    return places
 
 
 @pytest.mark.parametrize("number", PRINTED)

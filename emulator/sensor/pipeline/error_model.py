@@ -103,7 +103,6 @@ class ErrorModel:
         """Do nothing: there is no star index."""
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
-        """Answer a request."""
         if not self._running:
             done(PipelineEnded("error model: not running"))
         elif isinstance(request, ImageRequest):
@@ -245,7 +244,6 @@ def turned(attitude: Quaternion, turn_rad: list[float]) -> Quaternion:
 
 
 def unit_vector(x: float, y: float, z: float) -> Triple:
-    """Return the direction of a vector."""
     length = math.sqrt(x * x + y * y + z * z)
     return (x / length, y / length, z / length)
 

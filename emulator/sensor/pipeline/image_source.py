@@ -81,7 +81,6 @@ class CheckedImages:
         self._excess = None if dark is None else dark_excess(read_image(dark, allow_colour=True))
 
     def image(self, index: int) -> Counts:
-        """Return the image of an exposure."""
         image = self._source.image(index)
         height, width = image.shape
         if (width, height) != (self._camera.width, self._camera.height):

@@ -6,7 +6,6 @@ from starhil.emulator.sensor.pipeline.messages import Failure, JpgRequest, JpgRe
 
 
 def compress_image(request: JpgRequest) -> JpgResult | Failure:
-    """Compress a grey image as JPEG."""
     # Imported here because the process that serves the links needs neither, unless it has no worker.
     import cv2
     import numpy as np

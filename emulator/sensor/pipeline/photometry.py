@@ -1,4 +1,4 @@
-"""What a detector finds: the magnitude at which it still finds 90 % of the stars, and its error of a magnitude there.
+"""The limit of a detector: the magnitude at which it finds 90 % of the stars, and the error of a magnitude there.
 
 The features of the thesis count stars down to a magnitude, so they must not count what the detector often misses. It is
 measured as a laboratory would: fields of the sky at rest are rendered and their stars detected.
@@ -100,17 +100,17 @@ def _compared(frame: Frame, detections: Detections, zero_e: float) -> tuple[Arra
 
 def _limit_of(magnitude: Array, error: Array) -> MeasuredPhotometry:
     """The magnitude at which a logistic curve, fitted to which stars were found, has 90 %, and the error of the last above it."""
-    found = np.isfinite(error)
-    centre, slope = _fitted_curve(magnitude, found)
+    detected = np.isfinite(error)
+    centre, slope = _fitted_curve(magnitude, detected)
     faintest = float(np.quantile(magnitude, _RENDERED_SHARE))
     limit = min(centre - _ODDS / slope, faintest) if slope > 0.0 else faintest
-    above = np.flatnonzero(found & (magnitude <= limit))
+    above = np.flatnonzero(detected & (magnitude <= limit))
     last = error[above[np.argsort(magnitude[above], kind="stable")][-_LAST:]]
     sigma = float(_MAD_TO_SIGMA * np.median(np.abs(last - np.median(last)))) if last.size else _UNKNOWN_SIGMA
     return MeasuredPhotometry(limit, sigma)
 
 
-def _fitted_curve(magnitude: Array, found: Mask) -> tuple[float, float]:
+def _fitted_curve(magnitude: Array, detected: Mask) -> tuple[float, float]:
     """Maximum-likelihood fit of the share found, 1/(1 + exp(slope·(m − centre))); by Newton's method.
 
     A weak prior on the slope keeps it finite if one magnitude parts all stars found from the others.
@@ -121,7 +121,7 @@ def _fitted_curve(magnitude: Array, found: Mask) -> tuple[float, float]:
     for _ in range(_STEPS):
         share = 1.0 / (1.0 + elementwise(exp, -product(design, curve)))
         weight = np.maximum(share * (1.0 - share), _LEAST_WEIGHT)
-        slopes = np.sum(design * (found - share)[:, None], axis=0) - product(prior, curve)
+        slopes = np.sum(design * (detected - share)[:, None], axis=0) - product(prior, curve)
         curve += product(inverse(sum_of_products(design, design * weight[:, None]) + prior), slopes)
     slope = -float(curve[1])
     return middle + (float(curve[0]) / slope if slope else math.inf), slope

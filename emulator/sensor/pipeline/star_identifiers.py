@@ -80,7 +80,6 @@ class StarIdentifiers:
         self._build: tuple[StarIdentifierSetup, Future[StarIdentifier]] | None = None
 
     def get(self, setup: StarIdentifierSetup) -> tuple[StarIdentifier, bool]:
-        """Return the current star identifier, and whether it is the one for this setup."""
         self._adopt_finished_build()
         if self._current is None or not self._in_background:
             return self.build(setup), True

@@ -21,7 +21,7 @@ NICE: Final = 5
 
 def main() -> None:
     """Serve the emulator over an inherited socket."""
-    end_with_parent()  # a closed socket is not noticed during a long compilation
+    end_with_parent(int(sys.argv[2]))  # a closed socket is not noticed during a long compilation
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the emulator ends this process by closing the socket
     os.nice(NICE)

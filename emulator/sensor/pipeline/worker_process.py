@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
 import sys
@@ -45,6 +46,7 @@ class WorkerProcess:
             "-m",
             "starhil.emulator.sensor.pipeline.worker",
             str(inherited.fileno()),
+            str(os.getpid()),
         ]
         # in a process group of its own, so that Ctrl-C does not reach it while it imports
         self.process = subprocess.Popen(  # noqa: S603

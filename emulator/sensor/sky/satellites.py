@@ -90,11 +90,11 @@ class Satellites:
     def crossing(self, towards: Array, cosine: float, exposure_s: float) -> Crossing:
         """Return those that are in a cone about a direction (3,) in the middle of an exposure."""
         _, gaps, velocities = self._relative
-        seen = self.visible
-        distances = lengths(gaps[seen])
-        inside = product(gaps[seen], towards) >= cosine * distances
-        seen, distances = seen[inside], distances[inside]
-        gap, moved = gaps[seen], 0.5 * exposure_s * velocities[seen]
+        visible = self.visible
+        distances = lengths(gaps[visible])
+        inside = product(gaps[visible], towards) >= cosine * distances
+        visible, distances = visible[inside], distances[inside]
+        gap, moved = gaps[visible], 0.5 * exposure_s * velocities[visible]
         directions = np.stack([_unit(gap - moved), _unit(gap), _unit(gap + moved)])
         phases = elementwise(acos, np.clip(-product(directions[1], self.to_sun), -1.0, 1.0))
         lit = elementwise(sin, phases) + (math.pi - phases) * elementwise(cos, phases)

@@ -1,4 +1,4 @@
-"""The stars as the sky shows them, which is not quite as the unit's catalogue has them.
+"""The stars of the rendered sky, where it differs from the unit's catalogue.
 
 The catalogue stays as it is: it is also that of the truth, and only the difference matters to a star tracker. What the sky
 shows differs by the errors of the catalogue (the same in all images), by variable stars (at a date), and by the observer

@@ -50,7 +50,6 @@ class RowCode:
         self.enumerations[name] = enum
 
     def fill(self, icd: InterfaceDefinition, key_type: str) -> tuple[str, str]:
-        """Return declarations and codecs of all rows."""
         values: dict[str, Any] = {
             "prefix": self._prefix.upper(),
             "rows": [(row, self._name(row), key_of(icd, row)) for row in icd.rows],

@@ -7,7 +7,7 @@ is that of both.
 The images of a sequence show the same stars, so their answers are not independent. That a region of search keeps fitting says
 little new about its place, and its centre, which is the last answer, may drift away. Where a region stops fitting, the features are
 bad, and an answer that is not at the place of the last one is worse than one to a first image with the same ε_ψ. So sequences of
-images are simulated, and each kind of answer has the errors that it had there.
+images are simulated, and each kind of answer (`answer_sequence`) has the errors that it had there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from starid.arithmetic.elementary import exp, log, square
 from starid.arithmetic.matrices import length, lengths
 from starid.attitude import Attitude, random_attitude
 from starid.catalog.photometry import flux_ratio
-from starid.identification.thesis.feature_search import FeatureAnswer, FeatureSearch
+from starid.identification.thesis.answer_sequence import RIGHT_DEG, AnswerSequence, KeptAnswer
+from starid.identification.thesis.feature_search import FeatureSearch
 from starid.identification.thesis.features import FeatureVector
 
 FIELDS: Final = 800
@@ -35,9 +36,6 @@ IMAGES: Final = 6
 
 MOTIONS: Final = (0.0, 0.007, 0.05)
 """Motion from image to image in the simulated sequences, as a share of the width of the field: at rest, 0.3° and 2° of 42°."""
-
-RIGHT_DEG: Final = 1.5
-"""Error of the boresight up to which an answer is at the right place of the sky, degrees."""
 
 FAR_DEG: Final = 10.0
 """Error beyond which it is any: those between are of a region that has drifted, or of a neighbouring place."""
@@ -145,11 +143,9 @@ class FeatureErrors:
     upper
         Largest ε_ψ of each class, (k,).
     first, elsewhere
-        Errors of answers by classes of ε_ψ: to the first image of a sequence, and after a region that did not fit, away from the
-        place of the last answer.
+        Errors of these kinds of answers, by classes of ε_ψ.
     region, again
-        Errors of answers by the number of images in a row that were at the same place, one table for each of `MOTIONS`: from a
-        region that fits, and after one that did not, at the place of the last answer nevertheless.
+        Errors of these kinds by the number of answers in a row at the same place, one table for each of `MOTIONS`.
     """
 
     upper: Array
@@ -158,18 +154,13 @@ class FeatureErrors:
     region: tuple[ErrorTable, ...]
     again: tuple[ErrorTable, ...]
 
-    def of_first(self, error_psi: float) -> StatedError:
-        """Error of an answer to the first image."""
-        return self.first.stated(int(_rows(self.upper, error_psi)))
-
-    def of_elsewhere(self, error_psi: float) -> StatedError:
-        """Error of an answer away from the last one."""
-        return self.elsewhere.stated(int(_rows(self.upper, error_psi)))
-
-    def at_place(self, images: int, moved: float, *, fits: bool) -> StatedError:
-        """Error of the nth answer in a row at the same place, after a motion as a share of the field."""
-        tables = self.region if fits else self.again
-        return tables[int(np.searchsorted(_MOTION_LIMITS, moved))].stated(min(images, _ROW) - 1)
+    def of(self, kept: KeptAnswer, moved: float) -> StatedError:
+        """Error of an answer, after a motion as a share of the width of the field."""
+        if kept.kind in ("first", "elsewhere"):
+            table = self.first if kept.kind == "first" else self.elsewhere
+            return table.stated(int(_rows(self.upper, kept.answer.error_psi)))
+        tables = self.region if kept.kind == "region" else self.again
+        return tables[int(np.searchsorted(_MOTION_LIMITS, moved))].stated(min(kept.images, _ROW) - 1)
 
     @classmethod
     def of_search(
@@ -189,34 +180,25 @@ class FeatureErrors:
             which = number % len(MOTIONS)
             move = math.radians(MOTIONS[which] * search.database.parameters.fov_deg) * axis / length(axis)
             own = np.where(rng.uniform(size=stars) < _BLENDED, _BLEND_MAG * rng.normal(size=stars), 0.0)
+            kinds = {"first": first, "elsewhere": elsewhere, "region": region[which], "again": again[which]}
+            sequence = AnswerSequence(threshold, largest)
             centre: Attitude | None = None
-            held, exceeded = 0, False
             for _ in range(IMAGES):
                 features = _features_at(search, photometry, rng, own, truth)
                 if features is None:
                     break
                 local = (
                     None
-                    if centre is None or exceeded
+                    if centre is None or sequence.exceeded
                     else search.answer_in_region(features, centre, side_deg)
                 )
-                if local is not None and local.error_psi <= threshold:
-                    held += 1
-                    answer = local
-                    region[which].add(min(held, _ROW) - 1, answer, truth)
-                else:
-                    answer = search.answer(features)
-                    if local is not None and local.error_psi < answer.error_psi:
-                        answer = local
-                    held = held + 1 if is_near(answer.attitude, centre) else 0
-                    if held:
-                        again[which].add(min(held, _ROW) - 1, answer, truth)
-                    else:
-                        (first if centre is None else elsewhere).add(answer.error_psi, answer, truth)
-                if answer.error_psi > largest:
+                kept = sequence.next(local, map(search.answer, (features,)), centre, first=centre is None)
+                if kept is None:
                     break
-                exceeded = answer.error_psi > threshold
-                truth, centre = truth.rotated(move), answer.attitude.rotated(move)
+                kinds[kept.kind].add(kept, truth)
+                if not kept.valid:
+                    break
+                truth, centre = truth.rotated(move), kept.answer.attitude.rotated(move)
         upper = np.quantile(first.values, np.arange(1, _CLASSES + 1) / _CLASSES)
         upper[-1] = math.inf
         every = np.concatenate([kind.vectors for kind in (first, elsewhere, *region, *again)])
@@ -227,22 +209,28 @@ class FeatureErrors:
             return ErrorTable.of(_rows(upper, kind.values), kind.vectors, _CLASSES, far)
 
         def by_row(kinds: list[_Answers]) -> tuple[ErrorTable, ...]:
-            rows = [(np.array(kind.values, dtype=np.int64), kind.vectors) for kind in kinds]
-            return tuple(ErrorTable.of(*each, _ROW, far) for each in rows)
+            return tuple(ErrorTable.of(kind.rows, kind.vectors, _ROW, far) for kind in kinds)
 
         return cls(upper, by_error(first), by_error(elsewhere), by_row(region), by_row(again))
 
 
 class _Answers:
-    """Answers of one kind: ε_ψ or class, and error as a rotation vector, rad."""
+    """Answers of one kind: ε_ψ, number in a row, and error as a rotation vector, rad."""
 
     def __init__(self) -> None:
         self.values: list[float] = []
+        self._images: list[int] = []
         self._errors: list[Array] = []
 
-    def add(self, value: float, answer: FeatureAnswer, truth: Attitude) -> None:
-        self.values.append(value)
-        self._errors.append(answer.attitude.error_to(truth).rotation_vector_rad)
+    def add(self, kept: KeptAnswer, truth: Attitude) -> None:
+        self.values.append(kept.answer.error_psi)
+        self._images.append(kept.images)
+        self._errors.append(kept.answer.attitude.error_to(truth).rotation_vector_rad)
+
+    @property
+    def rows(self) -> Indices:
+        """Classes by the number in a row."""
+        return np.minimum(np.array(self._images, dtype=np.int64), _ROW) - 1
 
     @property
     def vectors(self) -> Array:
@@ -258,13 +246,6 @@ def off_deg(errors: Array) -> Array:
 def mean_squares(errors: Array) -> Array:
     """Mean squares (2,) of rotation vectors (n, 3) about an axis across the boresight, and about the boresight."""
     return np.array([square(errors[:, :2]).mean(), square(errors[:, 2]).mean()])
-
-
-def is_near(answer: Attitude, centre: Attitude | None) -> bool:
-    """Whether an answer is at the place of the last one, as far as features determine it; without one, it is not."""
-    if centre is None:
-        return False
-    return bool(off_deg(answer.error_to(centre).rotation_vector_rad[None])[0] <= RIGHT_DEG)
 
 
 def _rows(upper: Array, error_psi: ArrayLike) -> Indices:

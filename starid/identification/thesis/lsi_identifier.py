@@ -34,9 +34,10 @@ from starid.identification.geometric.verified import VerifiedIdentifier
 from starid.identification.options import REGION_DEG, LsiOptions
 from starid.identification.single_camera import CheckedDetections
 from starid.identification.solution import FeatureReport, Reason, Search, Solution
+from starid.identification.thesis.answer_sequence import AnswerSequence, KeptAnswer
 from starid.identification.thesis.database import DatabaseParameters, sky_of
 from starid.identification.thesis.database_choice import given_database, obtain_database
-from starid.identification.thesis.feature_error import RANDOM, FeatureErrors, Photometry, StatedError
+from starid.identification.thesis.feature_error import RANDOM, FeatureErrors, Photometry
 from starid.identification.thesis.feature_search import (
     ESTIMATE_SHARE,
     MIN_STARS,
@@ -162,7 +163,7 @@ class LsiIdentifier(VerifiedIdentifier):
             if options.refinement
             else None
         )
-        self.errors = None if options.refinement else self._feature_errors()
+        self._errors = None if options.refinement else self._feature_errors()
         self.last_report = LsiReport(None, 0, 0, math.nan)
 
     def _feature_errors(self) -> FeatureErrors:
@@ -217,6 +218,13 @@ class LsiIdentifier(VerifiedIdentifier):
         return self._verifier
 
     @property
+    def errors(self) -> FeatureErrors:
+        """Errors of attitudes of features alone."""
+        if self._errors is None:
+            raise StaridError("lsi refinement: is on, so the errors of features alone were not measured")
+        return self._errors
+
+    @property
     def zero_point(self) -> float | None:
         """Magnitude of unit flux, as given or as learned from the last answer; None if neither."""
         return self._zero_point
@@ -255,10 +263,18 @@ class LsiIdentifier(VerifiedIdentifier):
         xy = self._camera.border(4)[: MIN_STARS + 3] * 0.25 + 0.375 * np.array(
             [self._camera.width, self._camera.height]
         )
-        self.solve(CheckedDetections.of(xy, np.ones(len(xy))), [0.0])
+        self._solution(CheckedDetections.of(xy, np.ones(len(xy))), [0.0])
 
     def _identify(self, measured: CheckedDetections) -> Solution:
-        return self.solve(measured, self.zero_points(measured.flux))
+        return self._solution(measured, self.zero_points(measured.flux))
+
+    def _solution(self, measured: CheckedDetections, zero_points: Sequence[float]) -> Solution:
+        if self.options.refinement:
+            return self.solve(measured, zero_points)
+        fields = self.fields(measured, zero_points)
+        sequence = AnswerSequence(self.options.threshold, self.options.largest_error_psi)
+        kept = sequence.next(None, map(self.answer, (fields,)), None, first=True)
+        return self.by_features_alone(kept, "lsi", fields)
 
     def _track(self, measured: CheckedDetections, predicted: Attitude, window_px: float | None) -> Solution:
         """Find the attitude from the features, as `identify`: the algorithm uses no prediction."""
@@ -272,16 +288,12 @@ class LsiIdentifier(VerifiedIdentifier):
         first: Sequence[FeatureAnswer] = (),
         kept: Mask | None = None,
     ) -> Solution:
-        """Search the whole database: stage one, and with refinement stage two.
+        """Search the whole database with refinement: stage one, and stage two.
 
         `first` are answers to compare with that of the whole database, and `kept` is a mask of the detections from which
         features are computed; by default all.
         """
-        solution = (
-            self._first_verified(measured, zero_points, first, kept)
-            if self.options.refinement
-            else self._by_features(measured, zero_points, first, kept)
-        )
+        solution = self._first_verified(measured, zero_points, first, kept)
         if solution.valid:
             self.learn(solution, measured.flux)
         return solution
@@ -292,51 +304,56 @@ class LsiIdentifier(VerifiedIdentifier):
         field = search.field_stars(measured.xy, measured.flux, zero_point)
         return field if kept is None else field.only(kept)
 
-    def _by_features(
-        self,
-        measured: CheckedDetections,
-        zero_points: Sequence[float],
-        first: Sequence[FeatureAnswer],
-        kept: Mask | None,
-    ) -> Solution:
-        """The attitude of the features alone, at the first zero point for which there are any."""
-        for zero_point in zero_points:
-            features = self.search.features(self._fields(measured, self.search, zero_point, kept))
-            if features is None:
-                continue
-            answers = (*first, self.search.answer(features))
-            best = min(answers, key=lambda answer: answer.error_psi)
-            self.last_report = LsiReport(answers[-1].attitude, 0, 0, zero_point)
-            return self.by_features_alone(best, "lsi" if best is answers[-1] else "rsi", measured)
+    def fields(
+        self, measured: CheckedDetections, zero_points: Sequence[float]
+    ) -> list[tuple[float, FieldStars]]:
+        """Each zero point, with the stars of the field."""
+        return [(each, self._fields(measured, self.search, each, None)) for each in zero_points]
+
+    def answer(
+        self, fields: Sequence[tuple[float, FieldStars]], true_stars: Mask | None = None
+    ) -> FeatureAnswer | None:
+        """Answer of the whole database at the first zero point for which there are features; None if there is none.
+
+        `wanted` is a mask of the detections from which features are computed; by default all.
+        """
+        for zero_point, field in fields:
+            features = self.search.features(field if true_stars is None else field.only(true_stars))
+            if features is not None:
+                answer = self.search.answer(features)
+                self.last_report = LsiReport(answer.attitude, 0, 0, zero_point)
+                return answer
         self.last_report = LsiReport(None, 0, 0, math.nan)
-        return Solution.invalid(Reason.TOO_FEW_STARS)
+        return None
 
     def by_features_alone(
-        self, answer: FeatureAnswer, search: Search, measured: CheckedDetections
+        self,
+        kept: KeptAnswer | None,
+        search: Search,
+        fields: Sequence[tuple[float, FieldStars]],
+        moved: float = 0.0,
     ) -> Solution:
-        """The solution of the first stage; invalid if ε_ψ > K·τ.
+        """The solution of the first stage.
 
-        `search` says where the answer was found. Its error is that of an answer of the whole database to a first image.
+        `search` says where the answer was found, and `moved` is the motion since the last image as a share of the width of the
+        field. The error is that of a random attitude if the image does not show stars down to the brightness limit.
         """
-        report = report_of(answer, search)
-        if self.errors is None or answer.error_psi > self.options.largest_error_psi:
+        if kept is None:
+            return Solution.invalid(Reason.TOO_FEW_STARS)
+        report = report_of(kept.answer, search)
+        if not kept.valid:
             return dataclasses.replace(Solution.invalid(Reason.RESIDUAL), features=report)
-        found = Solution(
+        stated = self.errors.of(kept, moved)
+        if self.zero_point is not None and not self.search.reaches_limit(fields[0][1]):
+            stated = RANDOM
+        return Solution(
             valid=True,
             reason=Reason.OK,
-            quaternion_xyzw=answer.attitude.quaternion_xyzw,
+            quaternion_xyzw=kept.answer.attitude.quaternion_xyzw,
+            covariance=stated.covariance,
+            probability_false=stated.wrong,
             features=report,
         )
-        return self.with_error(found, measured, self.errors.of_first(answer.error_psi))
-
-    def with_error(self, solution: Solution, measured: CheckedDetections, stated: StatedError) -> Solution:
-        """A solution with its error; that of a random attitude if the image does not show stars down to the brightness limit."""
-        zero_point = self.zero_point
-        if zero_point is not None and not self.search.reaches_limit(
-            self._fields(measured, self.search, zero_point, None)
-        ):
-            stated = RANDOM
-        return dataclasses.replace(solution, covariance=stated.covariance, probability_false=stated.wrong)
 
     def _first_verified(
         self,

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -25,9 +26,9 @@ from starid.catalog import StarCatalog
 from starid.identification.options import RsiOptions
 from starid.identification.single_camera import CheckedDetections, SingleCameraIdentifier
 from starid.identification.solution import FeatureReport, Solution
+from starid.identification.thesis.answer_sequence import AnswerSequence
 from starid.identification.thesis.cme import matched_motion
 from starid.identification.thesis.false_stars import ObservedFrame
-from starid.identification.thesis.feature_error import is_near
 from starid.identification.thesis.feature_search import ESTIMATE_SHARE, FeatureAnswer, FieldStars
 from starid.identification.thesis.lsi_identifier import (
     WINDOW_PX,
@@ -159,8 +160,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         )
         self._before: ObservedFrame | None = None
         self._last: Attitude | None = None
-        self._held = 0
-        self._exceeded = False
+        self._sequence = AnswerSequence(options.threshold, options.largest_error_psi)
         self.statistics = RsiStatistics()
 
     @property
@@ -180,23 +180,21 @@ class RsiIdentifier(SingleCameraIdentifier):
         """Forget previous frames, the learned zero point and the statistics."""
         self.lsi.reset()
         self._before = self._last = None
-        self._held = 0
-        self._exceeded = False
+        self._sequence.reset()
         self.statistics = RsiStatistics()
 
     def _identify(self, measured: CheckedDetections) -> Solution:
         """Find the attitude in the whole database, from the stars that the filter keeps."""
         prior = self.preprocess(measured.xy, measured.flux)
-        solution = self._whole_sky(measured, prior)
-        if self._exceeded:
-            solution = self._after_failure(solution, measured, prior)
+        if self.options.refinement:
+            solution = self._remembered(self._whole_sky(measured, prior))
         else:
-            self._held = 0
-        self._remember(solution)
+            solution = self._by_features(measured, prior, None, first=not self._sequence.exceeded)
+        self._last = solution.attitude if solution.valid else None
         return dataclasses.replace(solution, features=prior.add_to(solution.features))
 
     def _whole_sky(
-        self, measured: CheckedDetections, prior: Preprocessed, first: tuple[FeatureAnswer, ...] = ()
+        self, measured: CheckedDetections, prior: Preprocessed, first: Sequence[FeatureAnswer] = ()
     ) -> Solution:
         """LSI, line 12 of algorithm 3: from the true stars and, if that fails, from all detections."""
         zero_points = self.lsi.zero_points(measured.flux)
@@ -217,49 +215,54 @@ class RsiIdentifier(SingleCameraIdentifier):
         centre = carried or predicted
         if carried is None and window_px is not None:
             side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
-        side = min(side, self.lsi.database.parameters.fov_deg)
-        if self._exceeded:
-            solution = self._after_failure(self._whole_sky(measured, prior), measured, prior)
-            report = prior.add_to(solution.features)
+        region = centre, min(side, self.lsi.database.parameters.fov_deg)
+        searched = None if self._sequence.exceeded else region
+        if self.options.refinement:
+            solution = self._remembered(self._refined(measured, prior, searched))
         else:
-            field, answers = self._in_region(measured, prior, centre, side)
-            local = None if field is None else self._accepted(measured, prior, field, answers)
-            solution = local or self._after_failure(
-                self._whole_sky(measured, prior, answers[:1]), measured, prior
-            )
-            report = prior.add_to(
-                solution.features,
-                triggered=local is None,
-                region_deg=side,
+            solution = self._by_features(measured, prior, searched, first=False)
+        report = prior.add_to(solution.features)
+        if searched is not None:
+            report = dataclasses.replace(
+                report,
+                triggered=solution.mode != "tracking",
+                region_deg=region[1],
                 region_at_deg=(centre.ra_deg, centre.dec_deg),
             )
+        self._last = solution.attitude if solution.valid else None
         self._count(solution, report)
-        self._remember(solution)
         return dataclasses.replace(solution, features=report)
 
-    def _remember(self, solution: Solution) -> None:
-        self._last = solution.attitude if solution.valid else None
-        if not solution.valid:
-            self._held = 0
-        features = solution.features
-        self._exceeded = features is None or not (
-            solution.valid and (features.refined or features.error_psi <= self._settings.tau)
-        )
+    def _remembered(self, solution: Solution) -> Solution:
+        """A refined solution, after which the region is searched if it was verified."""
+        self._sequence.exceeded = not solution.valid
+        return solution
 
-    def _after_failure(
-        self, solution: Solution, measured: CheckedDetections, prior: Preprocessed
+    def _by_features(
+        self,
+        measured: CheckedDetections,
+        prior: Preprocessed,
+        region: tuple[Attitude, float] | None,
+        *,
+        first: bool,
     ) -> Solution:
-        """The same answer of features alone, with the error that it has after a region that did not fit."""
-        errors, features = self.lsi.errors, solution.features
-        if errors is None or not solution.valid or features is None:
+        """The solution without refinement, from a region of search if one is given, or from the whole database.
+
+        The features are those of the true stars and, if these have no attitude, of all detections.
+        """
+        fields = self.lsi.fields(measured, self.lsi.zero_points(measured.flux))
+        local: FeatureAnswer | None = None
+        if region is not None and self.lsi.zero_point is not None:
+            features = self.lsi.search.features(fields[0][1].only(prior.true_stars))
+            local = None if features is None else self._parts.region(self.lsi.search, features, *region)
+        masks = [prior.true_stars] if prior.true_stars.all() else [prior.true_stars, None]
+        everywhere = (self.lsi.answer(fields, mask) for mask in masks)
+        kept = self._sequence.next(local, everywhere, self._carried(prior), first=first)
+        is_local = kept is not None and kept.answer is local
+        solution = self.lsi.by_features_alone(kept, "rsi" if is_local else "lsi", fields, self._moved(prior))
+        if kept is None or kept.kind != "region":
             return solution
-        if is_near(solution.attitude, self._carried(prior)):
-            self._held += 1
-            stated = errors.at_place(self._held, self._moved(prior), fits=False)
-        else:
-            self._held = 0
-            stated = errors.of_elsewhere(features.error_psi)
-        return self.lsi.with_error(solution, measured, stated)
+        return dataclasses.replace(solution, mode="tracking")
 
     def _moved(self, prior: Preprocessed) -> float:
         """Motion since the last image as a share of the width of the field."""
@@ -320,56 +323,42 @@ class RsiIdentifier(SingleCameraIdentifier):
             region_side(float(distance_deg.mean()), float(distance_deg.std(ddof=1)), self._settings),
         )
 
-    def _in_region(
-        self, measured: CheckedDetections, prior: Preprocessed, centre: Attitude, side_deg: float
-    ) -> tuple[FieldStars | None, tuple[FeatureAnswer, ...]]:
-        """The field's stars, and the answers of the cells of the region that are nearest to its features.
-
-        The first answer is that of the features as seen. With refinement, those of features with a star or two fewer or more
-        follow, the smallest ε_ψ first.
-        """
-        search, zero_point = self.lsi.search, self.lsi.zero_point
-        if zero_point is None:
-            return None, ()
-        field = search.field_stars(measured.xy, measured.flux, zero_point).only(prior.true_stars)
-        seen = search.features(field)
-        if seen is None:
-            return field, ()
-        observations = search.doubtful_features(field) if self.options.refinement else [seen]
-        found = [self._parts.region(search, features, centre, side_deg) for features in observations]
-        answers = [answer for answer in found if answer is not None]
-        return field, (*answers[:1], *sorted(answers[1:], key=lambda answer: answer.error_psi))
-
-    def _accepted(
-        self,
-        measured: CheckedDetections,
-        prior: Preprocessed,
-        field: FieldStars,
-        answers: tuple[FeatureAnswer, ...],
-    ) -> Solution | None:
-        """The solution of the first answer of the region that is good enough; None if there is none.
-
-        It is good enough if ε_ψ ≤ τ and, with refinement, if it is verified.
-        """
-        for answer in answers:
-            if answer.error_psi > self._settings.tau:
-                continue
-            if not self.options.refinement:
-                errors, found = self.lsi.errors, self.lsi.by_features_alone(answer, "rsi", measured)
-                if errors is not None:
-                    self._held += 1
-                    stated = errors.at_place(self._held, self._moved(prior), fits=True)
-                    found = self.lsi.with_error(found, measured, stated)
-                return dataclasses.replace(found, mode="tracking")
-            for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
-                if attitude is None:
+    def _refined(
+        self, measured: CheckedDetections, prior: Preprocessed, region: tuple[Attitude, float] | None
+    ) -> Solution:
+        """The first verified answer of the region with ε_ψ ≤ τ or, without one, of the whole database."""
+        answers: list[FeatureAnswer] = []
+        zero_point = self.lsi.zero_point
+        if region is not None and zero_point is not None:
+            field = self.lsi.search.field_stars(measured.xy, measured.flux, zero_point).only(prior.true_stars)
+            answers = self._in_region(field, region)
+            for answer in answers:
+                if answer.error_psi > self._settings.tau:
                     continue
-                solution = self.lsi.verify(measured, attitude, WINDOW_PX)
-                if solution.valid:
-                    self.lsi.learn(solution, measured.flux)
-                    report = report_of(answer, "rsi", refined=True)
-                    return dataclasses.replace(solution, mode="tracking", features=report)
-        return None
+                for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
+                    if attitude is None:
+                        continue
+                    solution = self.lsi.verify(measured, attitude, WINDOW_PX)
+                    if solution.valid:
+                        self.lsi.learn(solution, measured.flux)
+                        report = report_of(answer, "rsi", refined=True)
+                        return dataclasses.replace(solution, mode="tracking", features=report)
+        return self._whole_sky(measured, prior, answers[:1])
+
+    def _in_region(self, field: FieldStars, region: tuple[Attitude, float]) -> list[FeatureAnswer]:
+        """Answers of the cells of the region that are nearest to the features of a field.
+
+        The first is that of the features as measured; those of features with a star or two fewer or more follow, the smallest
+        ε_ψ first.
+        """
+        search = self.lsi.search
+        if search.features(field) is None:
+            return []
+        nearest = [
+            self._parts.region(search, features, *region) for features in search.doubtful_features(field)
+        ]
+        answers = [answer for answer in nearest if answer is not None]
+        return [*answers[:1], *sorted(answers[1:], key=lambda answer: answer.error_psi)]
 
 
 def _directions(positions_deg: Array) -> Array:

@@ -4,6 +4,8 @@ import pytest
 
 from starhil.emulator.benchmarks.algorithms import AlgorithmPlan, Scene, run_algorithms
 
+pytestmark = pytest.mark.long
+
 IMAGES = 8
 
 
@@ -13,7 +15,11 @@ def refined():
 
     def row(part):
         plan = AlgorithmPlan("ideal", IMAGES, 1, ("run.algorithm=rsi",), part)
-        rows = {row["algorithm"]: row for row in run_algorithms(plan, (Scene(0.3),))}
+        seen = []
+        rows = {
+            row["algorithm"]: row for row in run_algorithms(plan, (Scene(0.3),), lambda: seen.append(None))
+        }
+        assert len(seen) == Scene(0.3).images(IMAGES) == IMAGES
         return rows["thesis + refinement"]
 
     return {part: row(part) for part in (None, "region")}

@@ -65,13 +65,13 @@ def lines(kind: int, size, rng, **others):
 @pytest.mark.parametrize("kind", range(6), ids=NAMES)
 def test_an_error_alone_is_recovered_and_appears_in_no_other_line(kind):
     size = np.array([7.0, 7.0, 0.0]) if kind == ABERRATION else SIZE
-    found = lines(kind, size, np.random.default_rng(100 + kind))
+    error_lines = lines(kind, size, np.random.default_rng(100 + kind))
     expected = size if kind in (BIAS, THERMAL, ABERRATION) else coverage_factor(CONFIDENCE) * SIZE
-    np.testing.assert_allclose(found[kind].arcsec, expected, rtol=0.1)
+    np.testing.assert_allclose(error_lines[kind].arcsec, expected, rtol=0.1)
     faint = coverage_factor(CONFIDENCE) * FAINT * SIZE
     for other in set(range(6)) - {kind}:
         allowed = 1.1 * faint if other == NOISE else np.zeros(3)
-        assert np.all(found[other].arcsec <= allowed), NAMES[other]
+        assert np.all(error_lines[other].arcsec <= allowed), NAMES[other]
 
 
 def test_all_kinds_of_error_are_separated():
@@ -82,13 +82,13 @@ def test_all_kinds_of_error_are_separated():
         "position": np.array([2.0, 2.5, 6.0]),
         "noise": np.array([3.0, 3.5, 9.0]),
     }
-    found = lines(ABERRATION, np.array([8.0, 8.0, 0.0]), rng, **sizes)
+    error_lines = lines(ABERRATION, np.array([8.0, 8.0, 0.0]), rng, **sizes)
     factor = coverage_factor(CONFIDENCE)
-    np.testing.assert_allclose(found[BIAS].arcsec, np.abs(sizes["bias"]), rtol=0.25)
+    np.testing.assert_allclose(error_lines[BIAS].arcsec, np.abs(sizes["bias"]), rtol=0.25)
     for line, name in ((FIELD, "field"), (PIXEL, "position"), (NOISE, "noise")):
-        np.testing.assert_allclose(found[line].arcsec, factor * sizes[name], rtol=0.1)
-    np.testing.assert_allclose(found[ABERRATION].arcsec[:2], 8.0, rtol=0.1)
-    assert np.all(found[THERMAL].arcsec == 0.0)
+        np.testing.assert_allclose(error_lines[line].arcsec, factor * sizes[name], rtol=0.1)
+    np.testing.assert_allclose(error_lines[ABERRATION].arcsec[:2], 8.0, rtol=0.1)
+    assert np.all(error_lines[THERMAL].arcsec == 0.0)
 
 
 def test_frames_without_an_attitude_may_be_missing():

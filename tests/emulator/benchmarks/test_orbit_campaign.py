@@ -21,6 +21,8 @@ from starhil.emulator.benchmarks.orbit_campaign import (
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.orbit import KeplerOrbit
 
+pytestmark = pytest.mark.long
+
 PERIOD_S = 2.0 * math.pi * math.sqrt(6.928137e6**3 / 3.986004418e14)
 
 

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.lowest("typer")
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    ("error", "message"),
     [
         (FileNotFoundError(2, "No such file or directory", "a/b.txt"), "a/b.txt: No such file or directory"),
         (OSError(28, "No space left on device"), "No space left on device"),
@@ -32,7 +32,7 @@ pytestmark = pytest.mark.lowest("typer")
     ],
 )
 def test_an_operating_system_error_is_one_line_and_status_2(
-    error: Exception, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    error: Exception, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     built = typer.Typer()
 
@@ -46,7 +46,7 @@ def test_an_operating_system_error_is_one_line_and_status_2(
         app.main()
     printed = capsys.readouterr()
     assert caught.value.code == 2
-    assert (printed.out, printed.err) == ("", f"starhil: {said}\n")
+    assert (printed.out, printed.err) == ("", f"starhil: {message}\n")
 
 
 def test_a_recording_without_the_package_of_its_extra_is_rejected_before_the_start(
@@ -77,7 +77,7 @@ def test_a_folder_given_as_a_file_is_named(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ("rum", "no such command 'rum'. Did you mean 'run'? (see starhil --help)"),
         ("run --sed 3", "run: no such option"),
@@ -99,7 +99,7 @@ def test_a_folder_given_as_a_file_is_named(
     ],
 )
 def test_a_rejected_option_is_one_line_and_status_2(
-    arguments: str, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: str, message: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["starhil", *arguments.split()])
     with pytest.raises(SystemExit) as caught:
@@ -107,8 +107,8 @@ def test_a_rejected_option_is_one_line_and_status_2(
     printed = capsys.readouterr()
     assert caught.value.code == 2
     assert printed.out == ""
-    assert printed.err.startswith(f"starhil: {said}")
-    assert printed.err.endswith(" --help)\n") or said.startswith("--")  # that of our own check says all
+    assert printed.err.startswith(f"starhil: {message}")
+    assert printed.err.endswith(" --help)\n") or message.startswith("--")  # that of our own check says all
     assert printed.err.count("\n") == 1
 
 

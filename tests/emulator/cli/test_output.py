@@ -18,6 +18,8 @@ from starhil.emulator.cli import app, output
 from starid.cli import app as library
 from starid.cli import command_line
 from starid.cli.output import show_every_character
+from starid.identification.options import ALGORITHMS
+from starid.kernels.compile_progress import CompileProgress, kernels_of
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.workers import WORKER
 from tests.waiting import PATIENCE_S
@@ -49,12 +51,12 @@ def commands(group: Any = None, path: str = "") -> list[tuple[str, Any]]:
     """Every command of both programs with its path."""
     if group is None:
         programs = (app.build_app(), library.build_app())
-        return [found for program in programs for found in commands(typer.main.get_command(program))]
-    found: list[tuple[str, Any]] = []
+        return [each for program in programs for each in commands(typer.main.get_command(program))]
+    each: list[tuple[str, Any]] = []
     for name, command in group.commands.items():
         below = f"{path} {name}".strip()
-        found += commands(command, below) if hasattr(command, "commands") else [(below, command)]
-    return found
+        each += commands(command, below) if hasattr(command, "commands") else [(below, command)]
+    return each
 
 
 def test_every_option_that_names_a_file_to_write_states_the_rule() -> None:
@@ -189,17 +191,18 @@ def test_a_slow_start_reports_its_progress_on_stderr(
 ) -> None:
     compiled = iter((0, 7))
 
-    def count(_since: float) -> int:
+    def count(_progress: CompileProgress) -> int:
         try:
             return next(compiled)
         except StopIteration:
             slow_worker.touch()
             return 7
 
-    monkeypatch.setattr("starid.storage.cache.kernels_written_since", count)
+    monkeypatch.setattr(CompileProgress, "compiled", count)
     status, out, said = run_command_line(*command)
     assert (status, out) == (2, "")
     first, second, *_, last = said.splitlines()
-    assert first == "starting: 0 s"
-    assert second == "starting: 0 s, 7 kernels compiled; later starts use them"
+    total = len(kernels_of([output.PIPELINE, ALGORITHMS["geometric"].module]))
+    assert first == f"starting: 0 s, 0 of {total} kernels compiled; later starts use them"
+    assert second == f"starting: 0 s, 7 of {total} kernels compiled; later starts use them"
     assert last.endswith("no catalogue")

@@ -45,12 +45,12 @@ def test_truth_as_json_is_where_the_stars_are(
     attitude = Attitude.from_quaternion(truth["quaternion_xyzw"])
     assert (attitude.ra_deg, attitude.dec_deg, attitude.roll_deg) == pytest.approx((83.8, -1.2, 30.0))
     stars = np.array([[star["x_px"], star["y_px"]] for star in truth["stars"]])
-    found = detect(read_image(target))
-    gaps = np.linalg.norm(found.xy_px[:, None] - stars[None], axis=2)
-    off = found.xy_px - stars[gaps.argmin(axis=1)]
+    detections = detect(read_image(target))
+    gaps = np.linalg.norm(detections.xy_px[:, None] - stars[None], axis=2)
+    off = detections.xy_px - stars[gaps.argmin(axis=1)]
     near = gaps.min(axis=1) < 1.5
     assert near.sum() > 300
-    seen = DEFAULT_CAMERA.back_project(found.xy_px[near])
+    seen = DEFAULT_CAMERA.back_project(detections.xy_px[near])
     true = DEFAULT_CAMERA.back_project(stars[gaps.argmin(axis=1)][near])
     turn = np.linalg.svd(seen.T @ true)
     rotation = turn.U @ np.diag([1.0, 1.0, np.linalg.det(turn.U @ turn.Vh)]) @ turn.Vh

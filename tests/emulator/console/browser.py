@@ -57,15 +57,15 @@ def opened(browser, address, width=1280, height=800):
     """Yield a page of the console; whatever the browser's console says is a failure."""
     page = browser.new_page(viewport={"width": width, "height": height})
     page.set_default_timeout(1000 * PATIENCE_S)
-    said = []
-    page.on("console", lambda message: said.append(message.text))
-    page.on("pageerror", lambda error: said.append(str(error)))
+    lines = []
+    page.on("console", lambda message: lines.append(message.text))
+    page.on("pageerror", lambda error: lines.append(str(error)))
     page.goto(address)
     page.wait_for_selector("#link[data-state=connected]")
     page.wait_for_function("() => window.starhil && starhil.store.status")
     yield page
     page.close()
-    assert said == []
+    assert lines == []
 
 
 def wait_for_text(page, selector, text):

@@ -195,7 +195,7 @@ def test_everything_fits_the_width_and_text_is_at_least_12_px(page, width):
     page.set_viewport_size({"width": width, "height": {390: 844, 820: 1180, 3840: 2160}.get(width, 800)})
     for tab in TABS:
         open_tab(page, tab)
-        found = page.evaluate(
+        state = page.evaluate(
             """() => {
                 const seen = [...document.querySelectorAll("button, a, input, select, dd, dt, h1, h2, td, th, label, p, span, code")].filter((each) => each.checkVisibility() && !each.closest(".quiet, .skip, .scroll, #plots, #statistics, .log, select, .message"));
                 const wide = seen.filter((each) => { const box = each.getBoundingClientRect(); return box.width && (box.left < -1 || box.right > innerWidth + 1); });
@@ -204,7 +204,7 @@ def test_everything_fits_the_width_and_text_is_at_least_12_px(page, width):
                 return { scroll: document.documentElement.scrollWidth, wide: wide.map(name), small: small.map(name) };
             }"""
         )
-        assert found == {"scroll": width, "wide": [], "small": []}, tab
+        assert state == {"scroll": width, "wide": [], "small": []}, tab
     if width < 600:
         assert page.evaluate("document.getElementById('tabs').getBoundingClientRect().bottom <= innerHeight")
 
@@ -416,7 +416,7 @@ def test_axe_finds_nothing_serious(page, state):
     if not page.evaluate("Boolean(window.axe)"):
         page.evaluate(AXE.read_text())
     everywhere = state == "live"
-    found = []
+    gaps = []
     for _ in ("dark", "light"):
         page.click("#theme")
         views = [(1280, tab) for tab in (TABS if everywhere else ("faults",))]
@@ -424,7 +424,7 @@ def test_axe_finds_nothing_serious(page, state):
             page.set_viewport_size({"width": width, "height": 900})
             open_tab(page, tab)
             violations = page.evaluate(SERIOUS)
-            found += [(width, tab, *each) for each in violations]
+            gaps += [(width, tab, *each) for each in violations]
     if state == "error":
         command(page, "set_mode", mode="standby")
-    assert found == []
+    assert gaps == []

@@ -334,7 +334,7 @@ def test_the_page_keeps_eight_hours_of_frames_in_bounded_memory(page):
 def test_an_image_that_cannot_be_decoded_is_said_and_the_next_one_is_shown(page):
     track(page)
     page.wait_for_function("() => starhil.sky.painted > 0")
-    said, painted = page.evaluate(
+    text, painted = page.evaluate(
         """async () => {
             const { store, sky } = starhil;
             for (let turns = 0; sky.decoding && turns < 1000; turns++) await new Promise((resolve) => setTimeout(resolve, 10));
@@ -344,7 +344,7 @@ def test_an_image_that_cannot_be_decoded_is_said_and_the_next_one_is_shown(page)
             return [sky.notice.innerText, sky.painted];
         }"""
     )
-    assert said == "this image cannot be decoded"
+    assert text == "this image cannot be decoded"
     page.wait_for_function("painted => starhil.sky.painted > painted", arg=painted)
     assert not page.locator("#no-frame").is_visible()
 

@@ -31,16 +31,16 @@ def options(path, **more):
 
 def messages(path):
     with path.open("rb") as stream:
-        found = {}
+        by_topic = {}
         for schema, channel, message in make_reader(stream).iter_messages():
-            found.setdefault(channel.topic, []).append(
+            by_topic.setdefault(channel.topic, []).append(
                 (schema.name, message.log_time, json.loads(message.data))
             )
             properties = json.loads(schema.data)["properties"]
-            for name, value in found[channel.topic][-1][2].items():
+            for name, value in by_topic[channel.topic][-1][2].items():
                 wanted = properties.get(name, {}).get("type")
                 assert wanted is None or isinstance(value, JSON_TYPES[wanted]), (channel.topic, name, value)
-        return found
+        return by_topic
 
 
 async def record(emulation):
@@ -60,27 +60,32 @@ def test_images_truth_measurements_telemetry_and_events_are_read_back(run, tmp_p
         await record(emulation)
 
     run(scenario, options=options(path))
-    found = messages(path)
+    by_topic = messages(path)
     assert len(published) >= 2
     for topic, schema in (
         ("/image", "foxglove.CompressedImage"),
         ("/truth", "foxglove.FrameTransform"),
         ("/measurement", "starhil.Measurement"),
     ):
-        assert [name for name, _, _ in found[topic]] == [schema] * len(published)
-        assert [at for _, at, _ in found[topic]] == [each.mid_unix_ns for each in published]
-    assert base64.b64decode(found["/image"][0][2]["data"]) == PREVIEW.jpeg
-    rotation = found["/truth"][0][2]["rotation"]
+        assert [name for name, _, _ in by_topic[topic]] == [schema] * len(published)
+        assert [at for _, at, _ in by_topic[topic]] == [each.mid_unix_ns for each in published]
+    assert base64.b64decode(by_topic["/image"][0][2]["data"]) == PREVIEW.jpeg
+    rotation = by_topic["/truth"][0][2]["rotation"]
     x, y, z, w = ORION.quaternion_xyzw
     assert [rotation[name] for name in "xyzw"] == pytest.approx(
         [-x, -y, -z, w]
     )  # of the frame, not of its vectors
-    measured = found["/measurement"][-1][2]
+    measured = by_topic["/measurement"][-1][2]
     assert (measured["valid"], measured["mode"], measured["matched"]) == (True, "tracking", 35)
-    events = [(event["name"], event["message"]) for _, _, event in found["/events"]]
+    events = [(event["name"], event["message"]) for _, _, event in by_topic["/events"]]
     assert ("mode", "standby → lost in space (command)") in events
     assert ("telecommand", "set_mode mode=lost_in_space accepted") in events
-    assert found["/telemetry/device_status"][0][2]["mode"] in ("boot", "standby", "lost_in_space", "tracking")
+    assert by_topic["/telemetry/device_status"][0][2]["mode"] in (
+        "boot",
+        "standby",
+        "lost_in_space",
+        "tracking",
+    )
 
 
 def test_faults_traffic_units_and_what_identifies_the_run_are_read_back(run, tmp_path):
@@ -101,12 +106,12 @@ def test_faults_traffic_units_and_what_identifies_the_run_are_read_back(run, tmp
         await record(emulation)
 
     run(scenario, options=options(path, control="auto"))
-    found = messages(path)
-    events = [event["message"] for _, _, event in found["/events"]]
+    by_topic = messages(path)
+    events = [event["message"] for _, _, event in by_topic["/events"]]
     assert "begin: optical false_stars 3" in events
     assert "end: optical false_stars" in events
-    assert [faults for _, _, faults in found["/faults"]] == [{"optical": {"false_stars": 3}}, {}]
-    serial = [(line["out"], line["kind"], line["text"]) for _, _, line in found["/bus/serial"]]
+    assert [faults for _, _, faults in by_topic["/faults"]] == [{"optical": {"false_stars": 3}}, {}]
+    serial = [(line["out"], line["kind"], line["text"]) for _, _, line in by_topic["/bus/serial"]]
     assert (False, "telecommand", "set_mode mode=lost_in_space") in serial
     assert (True, "ack", "set_mode accepted") in serial
     with path.open("rb") as stream:

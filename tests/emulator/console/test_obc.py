@@ -110,11 +110,11 @@ def test_the_requests_of_the_obc_are_counted_and_those_of_the_console_are_not(ru
 def test_a_page_shows_the_present_values_of_parameters(run):
     async def scenario(emulation, _line):
         async with Page(emulation) as page:
-            known = {item["name"]: item for item in page.messages[0]["parameters"]}
+            parameters = {item["name"]: item for item in page.messages[0]["parameters"]}
             emulation.device.parameters.set({"exposure": 250})
             values = (await page.ask(do="parameters"))["values"]
-            assert (values["exposure"], known["exposure"]["unit"]) == (250, "ms")
-            assert known.keys() <= values.keys()
+            assert (values["exposure"], parameters["exposure"]["unit"]) == (250, "ms")
+            assert parameters.keys() <= values.keys()
 
     run(scenario, options=OPTIONS)
 

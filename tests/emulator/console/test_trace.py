@@ -40,7 +40,7 @@ def lines(items, dialect=Dialect.B):
 def test_serial_requests_and_replies_are_named_in_every_dialect(dialect):
     data = STATUS.encode(STATUS.example(), saturate=True)
     request, command = Request.of(STATUS.id), Request.of(MODE.id, MODE.encode({"mode": "standby"}))
-    found = lines(
+    trace = lines(
         [
             (False, CUBESPACE.encode_request(request)),
             (True, CUBESPACE.encode_reply(Reply(ReplyKind.TELEMETRY, STATUS.id, data), dialect)),
@@ -50,12 +50,12 @@ def test_serial_requests_and_replies_are_named_in_every_dialect(dialect):
         ],
         dialect,
     )
-    assert found[0] == ("telemetry", "device_status?")
-    assert found[1][0] == "reply"
-    assert found[1][1].startswith("device_status mode=boot error=none")
-    assert found[2] == ("part", "part of a message")
-    assert found[3] == ("telecommand", "set_mode mode=standby")
-    assert found[4] == ("nack", "set_mode refused: sequence")
+    assert trace[0] == ("telemetry", "device_status?")
+    assert trace[1][0] == "reply"
+    assert trace[1][1].startswith("device_status mode=boot error=none")
+    assert trace[2] == ("part", "part of a message")
+    assert trace[3] == ("telecommand", "set_mode mode=standby")
+    assert trace[4] == ("nack", "set_mode refused: sequence")
 
 
 def test_segments_on_can_are_joined_for_each_pair_of_nodes():
@@ -71,12 +71,12 @@ def test_segments_on_can_are_joined_for_each_pair_of_nodes():
 
 def test_requests_on_can_and_junk_are_distinguished():
     (frame,) = encode_request_frames(Request.of(STATUS.id), 1, 4)
-    found = lines(
+    trace = lines(
         [(False, frame), (False, CanFrame(0x1FFFFFFF, b"\x01")), (True, CanFrame(0x05EE0401, bytes(3)))]
     )
-    assert found[0] == ("telemetry", "1→4 device_status?")
-    assert found[1][0] == "fault"
-    assert found[2] == ("reply", "4→1 id 238")
+    assert trace[0] == ("telemetry", "1→4 device_status?")
+    assert trace[1][0] == "fault"
+    assert trace[2] == ("reply", "4→1 id 238")
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,7 @@ def test_truth_is_read_back_and_swapped_while_running(run):
             assert later["roll_deg"] == pytest.approx(6.0)  # three seconds after the swap
             by_unix = await control.do("truth", unix_s=truth["unix_s"] + 3.0)
             assert by_unix["roll_deg"] == pytest.approx(6.0, abs=1e-4)
-            for wrong, said in (
+            for wrong, message in (
                 ({"truth": 3}, "truth: must be an object with the keys of [truth] in a profile"),
                 ({"truth": {"kind": "fixed", "x": 1}}, "truth.x: unknown key; known: attitude, kind, mount"),
                 ({"truth": {}}, f"truth.kind: must be one of {', '.join(sorted(KINDS))}"),
@@ -115,7 +115,7 @@ def test_truth_is_read_back_and_swapped_while_running(run):
                     "truth.attitude.ra_deg: must be a number (given: 'x')",
                 ),
             ):
-                assert await control.do("set_truth", **wrong) == {"ok": False, "error": said}
+                assert await control.do("set_truth", **wrong) == {"ok": False, "error": message}
             bad = await control.do("set_truth", truth={"kind": "rate"})
             assert bad == {"ok": False, "error": "truth.rate_deg_s: missing"}
             assert not (await control.do("set_truth", truth={"kind": "file", "path": "gone.csv"}))["ok"]
@@ -265,7 +265,7 @@ def test_a_line_that_is_not_completed_in_time_ends_its_connection_only(run, monk
 
 
 @pytest.mark.parametrize(
-    ("truth", "said"),
+    ("truth", "message"),
     [
         ({"kind": "file", "path": "a\0b"}, "embedded null"),
         ({"kind": "live", "host": "127.0.0..1"}, "truth feed udp:127.0.0..1:0: cannot listen"),
@@ -284,12 +284,12 @@ def test_a_line_that_is_not_completed_in_time_ends_its_connection_only(run, monk
         ),
     ],
 )
-def test_an_invalid_truth_is_rejected_and_the_connection_kept(run, truth, said):
+def test_an_invalid_truth_is_rejected_and_the_connection_kept(run, truth, message):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             answer = await control.do("set_truth", truth=truth)
             assert not answer["ok"]
-            assert said in answer["error"]
+            assert message in answer["error"]
             assert "\n" not in answer["error"]
             assert (await control.do("status"))["truth_kind"] == "fixed"
 

@@ -147,11 +147,11 @@ class Tumble:
 
 def reasons(bench, seconds: int) -> list[str]:
     """The reason of each frame."""
-    seen = []
+    measurements = []
     for _ in range(seconds):
         bench.step(1.0)
-        seen.append(bench.read("precise_attitude")["reason"])
-    return seen
+        measurements.append(bench.read("precise_attitude")["reason"])
+    return measurements
 
 
 def test_one_frame_without_stars_in_a_tumble_costs_no_other(make_bench):

@@ -15,6 +15,8 @@ from starhil.emulator.run.faults import FaultRequest, Faults
 from starhil.emulator.run.truth_log import compare
 from starhil.protocol.icd.conventions import NANOSECONDS
 
+pytestmark = pytest.mark.long
+
 
 @pytest.fixture
 def ticking(make_bench):

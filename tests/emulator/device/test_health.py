@@ -52,11 +52,11 @@ def test_a_fast_cycle_leaves_out_idling_and_then_the_transfer(make_bench):
     bench.command("set_update_rate", rate=2.0)
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.0)
-    seen = set()
+    values = set()
     for _ in range(250):
-        seen.add(bench.read("health")["phase"])
+        values.add(bench.read("health")["phase"])
         bench.step(STEP_S)
-    assert seen == {"imager_on", "exposure", "transfer"}
+    assert values == {"imager_on", "exposure", "transfer"}
 
 
 def test_without_frames_the_unit_idles(bench):

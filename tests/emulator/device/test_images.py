@@ -262,7 +262,7 @@ def test_a_block_ends_with_its_file(bench, offset, length, loaded):
 
 def counters(bench):
     assert bench.command("reset_file_list") is ErrorCode.OK
-    found = []
+    names = []
     while True:
         assert bench.read("file_info") == dict.fromkeys(bench.icd.telemetry["file_info"].named_fields, 0) | {
             "updating": True
@@ -270,8 +270,8 @@ def counters(bench):
         bench.step(0.03)
         info = bench.read("file_info")
         if not info["type"]:
-            return found
-        found.append(info["counter"])
+            return names
+        names.append(info["counter"])
         assert bench.command("advance_file_list") is ErrorCode.OK
 
 
@@ -396,7 +396,7 @@ def test_packets_of_a_burst_are_read_one_by_one(bench):
 
 
 @pytest.fixture
-def held(bench, monkeypatch):
+def held_requests(bench, monkeypatch):
     """Hold back what the pipeline is asked from now on; return the requests, each with its callback."""
     requests = []
     monkeypatch.setattr(
@@ -412,32 +412,32 @@ def images(requests):
             done(ImageResult(request.edge, request.edge, 7, bytes(request.edge**2)))
 
 
-def test_an_image_that_the_pipeline_delivers_late_is_stored_when_it_comes(bench, held):
+def test_an_image_that_the_pipeline_delivers_late_is_stored_when_it_comes(bench, held_requests):
     assert bench.command("save_image", image_size="size_64") is ErrorCode.OK
     bench.step(5.0)
     assert bench.read("image_status")["status"] != "ok"
-    images(held)
+    images(held_requests)
     assert bench.read("image_status") == {"percent": 100, "status": "ok"}
     assert bench.device.images.state.stored.frame == 7
 
 
 @pytest.mark.parametrize("wait_s", [0.05, 0.7, 5.0])
-def test_a_reset_ends_a_capture_and_what_comes_of_it_later_is_dropped(bench, held, wait_s):
+def test_a_reset_ends_a_capture_and_what_comes_of_it_later_is_dropped(bench, held_requests, wait_s):
     bench.command("save_image", image_size="size_64")
     bench.step(wait_s)
     bench.device.reset("watchdog")
     bench.step(5.0)
-    images(held)
+    images(held_requests)
     bench.step(5.0)
     assert bench.device.images.state.stored is None
     assert not bench.device.images.state.busy
 
 
-def test_no_chunk_is_loaded_while_the_image_is_being_opened(bench, held):
+def test_no_chunk_is_loaded_while_the_image_is_being_opened(bench, held_requests):
     bench.command("set_mode", mode="lost_in_space")
     open_last = bench.device.images.open_last(64)
     assert bench.command("advance_image_download", next_frame=0) is ErrorCode.BUSY
     bench.step(5.0)
-    images(held)
+    images(held_requests)
     assert bench.command("advance_image_download", next_frame=0) is ErrorCode.OK
     assert open_last.done

@@ -58,15 +58,15 @@ def test_results_change_the_mode(here, valid, tracked, enabled, there):
 
 
 def test_mode_changes_are_reported_with_their_cause():
-    seen = []
-    modes = Modes(seen.append)
+    transitions = []
+    modes = Modes(transitions.append)
     modes.booted()
     modes.fail("sensor")
     assert modes.error == "sensor"
     modes.command(Mode.STANDBY, has_attitude=False)
     modes.command(Mode.STANDBY, has_attitude=False)
     assert modes.error == ""
-    assert [(t.after, t.cause) for t in seen] == [
+    assert [(t.after, t.cause) for t in transitions] == [
         (Mode.STANDBY, Cause.BOOTED),
         (Mode.ERROR, Cause.FAULT),
         (Mode.STANDBY, Cause.COMMAND),

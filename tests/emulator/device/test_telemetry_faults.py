@@ -99,14 +99,14 @@ def test_a_wrong_attitude_is_off_by_the_angle_in_every_form_with_all_flags_good(
     error = attitude_of(reading).error_to(true)
     assert np.degrees(error.rotation_vector_rad) == pytest.approx([0.0, 0.5, 0.0], abs=1e-4)
     bench.inject(jump_deg=2.0)
-    seen = []
+    rows = []
     for _ in range(3):
         angle = attitude_of(bench.read(ROW)).error_to(true)
         assert angle.total_arcsec == pytest.approx(7200.0, abs=1.0)
         assert attitude_of(bench.read(ROW)).error_to(attitude_of(bench.read(ROW))).total_arcsec < 1e-3
-        seen.append(tuple(np.round(angle.rotation_vector_rad, 6)))
+        rows.append(tuple(np.round(angle.rotation_vector_rad, 6)))
         bench.step(0.2)
-    assert len(set(seen)) == 3
+    assert len(set(rows)) == 3
 
 
 def test_a_quaternion_is_conjugated(found):
@@ -127,11 +127,11 @@ def test_the_pattern_in_time_the_count_and_the_probability(found):
     bench = found()
 
     def wrong(reads, gap_s=0.1):
-        seen = []
+        values = []
         for _ in range(reads):
-            seen.append(bench.read("device_status")["mode"] == 200)
+            values.append(bench.read("device_status")["mode"] == 200)
             bench.step(gap_s)
-        return seen
+        return values
 
     bench.inject(row="device_status", set={"mode": 200}, after_s=0.25, for_s=0.15, every_s=1.0)
     assert [index for index, hit in enumerate(wrong(24)) if hit] == [3, 13, 23]
@@ -143,7 +143,7 @@ def test_the_pattern_in_time_the_count_and_the_probability(found):
 
 
 @pytest.mark.parametrize(
-    ("fault", "said"),
+    ("fault", "message"),
     [
         ({"row": "precise_attitud", "freeze": "all"}, "did you mean precise_attitude?"),
         ({"row": ROW, "set": {"q_xx": 0.5}}, "row precise_attitude has no field 'q_xx'"),
@@ -157,7 +157,7 @@ def test_the_pattern_in_time_the_count_and_the_probability(found):
         ({"answer_with": "nothing"}, "telemetry.answer_with: no telemetry row named 'nothing'"),
     ],
 )
-def test_what_can_have_no_effect_is_rejected(found, fault, said):
+def test_what_can_have_no_effect_is_rejected(found, fault, message):
     bench = found()
     bench.links["serial"] = SimpleNamespace(
         bus="serial",
@@ -166,7 +166,7 @@ def test_what_can_have_no_effect_is_rejected(found, fault, said):
     )
     with pytest.raises(EmulatorError) as error:
         bench.inject(**fault)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert bench.faults.describe() == {}
 
 

@@ -120,24 +120,24 @@ def _after_all_others(key: str) -> int:
 def contents(unit: str) -> list[tuple[str, str, dict[str, Any]]]:
     """Return level, key and content of every fault to try on a unit."""
     controls = {level["level"]: level["controls"] for level in fault_controls(load_unit(), ["serial", "can"])}
-    found = []
+    requests = []
     for level, model in LEVELS.items():
         by_name = {control["name"]: control for control in controls[level]}
         for key in sorted(model.model_fields, key=_after_all_others):
             if OTHER_UNIT.get((level, key), "cubestar") == unit:
                 content = EXAMPLES.get(level, {}).get(key) or {key: derived(by_name[key])}
-                found.append((level, key, content))
-    return found
+                requests.append((level, key, content))
+    return requests
 
 
 def request_of(level: str, content: dict[str, Any]) -> dict[str, Any]:
     """Return a request for a fault; of telemetry without an effect, for none."""
-    wanted: Any = content
+    value: Any = content
     if level == "telemetry":
-        wanted = (
+        value = (
             [content] if set(content) - {"row", "probability", "count", "after_s", "for_s", "every_s"} else []
         )
-    return {"do": "fault", level: wanted}
+    return {"do": "fault", level: value}
 
 
 def without(key: str, content: dict[str, Any]) -> dict[str, Any]:
@@ -276,16 +276,16 @@ class Ways:
         (hello,) = [message for message in page.messages if message["type"] == "hello"]
         controls = {level["level"]: level["controls"] for level in hello["faults"]}
         for request in requests:
-            wanted = dict(request)
-            for level in set(wanted) & set(LEVELS):
-                content = wanted[level]
+            fields = dict(request)
+            for level in set(fields) & set(LEVELS):
+                content = fields[level]
                 whole = (
                     [filled_in(controls[level], each) for each in content]
                     if isinstance(content, list)
                     else filled_in(controls[level], content)
                 )
-                wanted[level] = whole
-            answer = wait(page.ask(do="control", request=wanted))
+                fields[level] = whole
+            answer = wait(page.ask(do="control", request=fields))
             assert answer["ok"], (request, answer)
             if request["do"] == "step":
                 self._stepped()

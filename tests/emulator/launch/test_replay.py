@@ -561,13 +561,13 @@ def test_a_truth_log_is_compared_to_its_resolution_and_a_difference_names_the_ma
     (folder / RUN_FILE).write_text(json.dumps(run))
     assert report_of(folder).differences == []
     changed_cell(folder, column, change)
-    found = report_of(folder).differences
+    differences = report_of(folder).differences
     if is_named:
-        difference, machine = found
+        difference, machine = differences
         assert re.match(rf"truth log: row \d+ differs in {column}: recorded ", difference)
         assert re.fullmatch(r"recorded on another machine: libc musl 9 \(here .+\)", machine)
     else:
-        assert found == []
+        assert differences == []
 
 
 def test_a_machine_without_a_description_of_its_processor_is_named_by_its_architecture(monkeypatch, tmp_path):
@@ -577,7 +577,7 @@ def test_a_machine_without_a_description_of_its_processor_is_named_by_its_archit
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("device.firmware_minor=0", "identical"),
         ("device.firmware_minor=9", "identification, byte 3: recorded 00, now 09"),
@@ -585,7 +585,7 @@ def test_a_machine_without_a_description_of_its_processor_is_named_by_its_archit
         ("parameters.update_rate=0.5", "the device behaves differently"),
     ],
 )
-def test_another_profile_is_compared_with_the_recording(record, tmp_path, override, said):
+def test_another_profile_is_compared_with_the_recording(record, tmp_path, override, message):
     async def scenario(emulation, _line):
         await talk(emulation, 3)
 
@@ -593,8 +593,8 @@ def test_another_profile_is_compared_with_the_recording(record, tmp_path, overri
     mine = tmp_path / "mine.toml"
     mine.write_text('[parameters]\nstart_mode = "lost_in_space"\nupdate_rate = 5.0\n')
     status, out, err = run_command_line("replay", str(folder), "--profile", str(mine), "--set", override)
-    assert (status, err) == (0 if said == "identical" else 1, "")
-    assert said in out
+    assert (status, err) == (0 if message == "identical" else 1, "")
+    assert message in out
 
 
 def test_a_key_of_the_recorded_profile_is_changed_and_the_fields_that_differ_are_listed(record, tmp_path):
@@ -808,12 +808,12 @@ def test_a_run_with_truth_and_orbit_from_standard_files_is_repeated(record, tmp_
     oem = ["CCSDS_OEM_VERS = 2.0", "META_START", *keywords, "META_STOP", *places]
     (tmp_path / "truth").write_text("\n".join(aem) + "\n")
     (tmp_path / "orbit").write_text("\n".join(oem) + "\n")
-    seen = []
+    answers = []
 
     async def scenario(emulation, _line):
         await talk(emulation, 3)
         truth = emulation.device.surroundings.state(2_000_000_000)
-        seen.append((truth.unix_s, float(truth.orbit.position_m[2])))
+        answers.append((truth.unix_s, float(truth.orbit.position_m[2])))
 
     folder = record(
         scenario,
@@ -824,7 +824,7 @@ def test_a_run_with_truth_and_orbit_from_standard_files_is_repeated(record, tmp_
     (tmp_path / "truth").unlink()
     (tmp_path / "orbit").unlink()
     assert report_of(folder).differences == []
-    assert seen[0] == (1774008002.0, pytest.approx(15_000.0, abs=1.0))
+    assert answers[0] == (1774008002.0, pytest.approx(15_000.0, abs=1.0))
 
 
 def test_paths_of_the_profile_refer_to_its_folder_and_the_copied_truth_to_the_recording(tmp_path):

@@ -301,9 +301,9 @@ def test_a_catalogue_that_the_pipeline_cannot_read_ends_in_one_line_and_status_2
     check_rejected(["--set", "catalog.path=/no/such/file"], "/no/such/file")
 
 
-def check_rejected(arguments, said):
+def check_rejected(arguments, message):
     status, out, err = run_command_line("run", "--can", "off", *arguments)
     assert (status, out) == (2, ""), err
     (line,) = log_lines(err)
     assert line.startswith("starhil: ")
-    assert said in line
+    assert message in line

@@ -38,15 +38,15 @@ def test_damage_changes_every_byte_string():
 
 
 def test_each_corrupted_item_differs_in_one_bit_and_is_shown_as_it_is_sent():
-    sent, seen = [], []
+    sent, received = [], []
     clock = SteppedClock()
     faults = WireFaults(sent.append, SerialDamage(), clock, Scheduler(), seed=1)
-    faults.listener = seen.append
+    faults.listener = received.append
     faults.settings = WireFault(corrupt=1.0)
     for _ in range(3):
         faults.send(bytes(4))
     assert [int.from_bytes(item).bit_count() for item in sent] == [1, 1, 1]
-    assert seen == sent
+    assert received == sent
     assert len(sent) == 3
 
 

@@ -96,12 +96,12 @@ def test_a_save_is_answered_on_its_link_when_the_disk_is_done(bench, fails):
         bench.device._background = lambda _work, done: waiting.append(done)
         row = bench.icd.telecommands["save_parameters"].id
         error = EmulatorError("state file: cannot be written") if fails else None
-        wanted = ErrorCode.INTERNAL if fails else ErrorCode.OK
+        code = ErrorCode.INTERNAL if fails else ErrorCode.OK
         assert linked.over_can(row) == []
         waiting.pop()(error)
         host = CanHostReceiver(1, 4)
         (reply,) = [event for frame in linked.bus.take() for event in host.feed(frame, 0.0)]
-        assert (reply.id, reply.code) == (row, wanted)
+        assert (reply.id, reply.code) == (row, code)
         assert linked.uart.take() == []
         assert linked.over_serial(row) == []
         waiting.pop()(error)

@@ -51,12 +51,12 @@ def test_what_passes_is_named_as_far_as_the_unit_has_such_a_link(name):
 
 def test_a_reply_without_an_id_is_that_to_the_last_request():
     decoder = Decoder(ICD, lambda: Dialect.B)
-    asked = CUBESPACE.encode_request(Request(RequestKind.TELEMETRY, STATUS.id))
+    request_bytes = CUBESPACE.encode_request(Request(RequestKind.TELEMETRY, STATUS.id))
     reply = Reply(ReplyKind.TELEMETRY, STATUS.id, STATUS.encode(STATUS.example(), saturate=True))
     answer = CUBESPACE.encode_reply(reply, Dialect.B)
     kinds = [
         decoder.line(WireItem(0.0, "serial", outgoing=item is answer, item=item))["text"]
-        for item in (asked, answer)
+        for item in (request_bytes, answer)
     ]
     assert all(STATUS.name in text for text in kinds), kinds
 

@@ -135,24 +135,6 @@ def test_a_calibration_written_by_starid_is_used(tmp_path):
     assert load_profile(write(tmp_path, written)).calibration.matrix() == rows
 
 
-@pytest.mark.parametrize(
-    ("key", "message"),
-    [
-        ("sigma = [1.0]", "calibration.sigma"),
-        ("sigma = [-1.0, 1, 1, 1, 1, 1, 1, 1, 1]", "calibration.sigma"),
-        (f"covariance = {np.ones((9, 8)).tolist()}", "calibration.covariance"),
-        (f"covariance = {np.tri(9).tolist()}", "row 1, column 2 is not that of a covariance matrix"),
-        (f"covariance = {(2.0 - np.eye(9)).tolist()}", "row 1, column 2 is not that of a covariance matrix"),
-        (f"covariance = {(-np.eye(9)).tolist()}", "row 1, column 1 is not that of a covariance matrix"),
-    ],
-)
-def test_a_wrong_calibration_is_named(tmp_path, key, message):
-    path = write(tmp_path, f"[calibration]\n{key}\n")
-    with pytest.raises(EmulatorError) as caught:
-        load_profile(path)
-    assert message in str(caught.value)
-
-
 MOUNTS = {
     "quaternion_xyzw": "quaternion_xyzw = [0.0, 0.0, 0.0, 1.0]",
     "matrix": "matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]",
@@ -231,50 +213,9 @@ def test_overrides_are_toml_or_text():
     assert profile.truth.kind == "fixed"
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("[run]\nsede = 1\n", "run.sede: unknown key; did you mean seed?"),
-        ("[rum]\nseed = 1\n", "rum: unknown key; did you mean run?"),
-        (f'unit = "{"a" * 300}"\n', "unit: unit 'aaa"),
-        ('unit = "cubstar"\n', "unit: unit 'cubstar': not found; give a path, or one of: cubestar"),
-        ("[run]\nseed = -1\n", "run.seed: must be at least 0 (given: -1)"),
-        ("[run]\nseed = '1'\n", "run.seed: must be a whole number (given: '1')"),
-        ("[links.can]\naddress = 255\n", "links.can.address"),
-        ("[truth]\nkind = 'wobble'\n", "truth.kind: must be one of 'fixed', 'rate'"),
-        ("[truth]\nrate_deg_s = [0, 0, 1]\n", "truth.kind: must be one of '42', 'file', 'fixed'"),
-        ("truth = 3\n", "truth: must be a"),
-        ("run = 3\n", "run: must be a table (given: 3)"),
-        ("[truth]\nkind = 'rate'\n", "truth.rate_deg_s: missing"),
-        ("[truth]\nkind = 'rate'\nrate = [0, 0, 1]\n", "truth.rate: unknown key; did you mean rate_deg_s?"),
-        ("[truth]\nkind = 'rate'\nrate_rad_s = [0, 0, 1]\n", "truth.rate_"),
-        ("[truth]\nkind = 'fixed'\nattitude = {ra_deg = 1.0}\n", "give ra_deg and dec_deg"),
-        (
-            "[truth]\nkind = 'fixed'\nra_deg = 1.0\n",
-            "truth.ra_deg: unknown key; did you mean attitude.ra_deg?",
-        ),
-        ("[truth]\nkind = 'fixed'\nattitude = {quaternion_xyzw = [1.0, 1.0, 0.0, 0.0]}\n", "not of length 1"),
-        ("[truth]\nkind = 'slew'\nsegments = [{do = 'hold', secs = 1.0}]\n", "truth.segments.0.sec"),
-        ("[parameters]\nserial_baud = 9600\n", "parameters.serial_baud: set links.serial.baud instead"),
-        (
-            "[truth]\nkind = 'slew'\nsegments = [{seconds = 1.0}]\n",
-            "do: must be one of 'hold', 'rate', 'slew'",
-        ),
-        (
-            "[run]\nalgorithm = ['lsi']\n[identifier]\ncache = true\n",
-            "run.algorithm: must be one of 'geometric'",
-        ),
-        ("[run\n", "not valid TOML"),
-        ('extends = "no_such"\n', "no_such"),
-        (f'extends = "{"a" * 300}"\n', "File name too long"),
-        ("extends = 3\n", "extends"),
-    ],
-)
-def test_a_bad_profile_is_named_with_file_key_and_remedy(tmp_path, text, said):
-    path = write(tmp_path, text)
-    message = refusal(path)
-    assert said in message
-    assert path in message
+@pytest.mark.parametrize(("key", "message"), [("unit", "unit: unit 'aaa"), ("extends", "File name too long")])
+def test_a_name_of_300_letters_is_not_found_and_named(tmp_path, key, message):
+    assert message in refusal(write(tmp_path, f'{key} = "{"a" * 300}"\n'))
 
 
 def test_all_errors_of_a_profile_are_listed_each_with_its_source_key_and_remedy(tmp_path):
@@ -410,11 +351,11 @@ BOUNDED_BY_LENGTH_1 = "quaternion_xyzw"
 
 @pytest.mark.parametrize("model", [Profile, Scenario])
 def test_every_number_of_a_profile_and_a_scenario_has_both_bounds(model):
-    found = dict(_numbers(model.model_json_schema()))
-    assert len(found) > 30
+    numbers = dict(_numbers(model.model_json_schema()))
+    assert len(numbers) > 30
     unbounded = [
         path
-        for path, schema in found.items()
+        for path, schema in numbers.items()
         if not ({"minimum", "exclusiveMinimum"} & schema.keys() and "maximum" in schema)
         and not path.endswith(BOUNDED_BY_LENGTH_1)
     ]

@@ -36,15 +36,15 @@ def solved(pipeline, parameters) -> list[tuple[Attitude, Attitude]]:
     """True and measured attitudes in a few random fields."""
     settings = SolverSettings.of(parameters)
     rng = np.random.default_rng(7)
-    found = []
+    errors = []
     for index in range(FIELDS):
         truth = random_attitude(rng)
         exposure_s = parameters["exposure"] / 1000.0
         request = FrameRequest(index, TruthState(truth, ZERO_RATE), exposure_s, 1.0, settings=settings)
         result = pipeline.handle(request)
         assert result.valid, result
-        found.append((truth, Attitude(np.array(result.quaternion_xyzw))))
-    return found
+        errors.append((truth, Attitude(np.array(result.quaternion_xyzw))))
+    return errors
 
 
 def turn_by_calibration(optics, calibrated, truth, count) -> np.ndarray:
@@ -111,7 +111,7 @@ def test_what_is_known_of_a_wrong_calibration_changes_the_stated_uncertainty_onl
         pipeline_setup(load_profile("cubestar", overrides))
         for overrides in ([], ["calibration.sigma=[0, 0, 0, 0, 0, 0, 0, 0, 0]"])
     ]
-    known, unknown = map(Pipeline, setups)
+    calibrated, unknown = map(Pipeline, setups)
     request = FrameRequest(
         0,
         TruthState(Attitude.from_radec_roll(83.8, -1.2, 0.0), ZERO_RATE),
@@ -119,7 +119,7 @@ def test_what_is_known_of_a_wrong_calibration_changes_the_stated_uncertainty_onl
         1.0,
         settings=setups[0].settings,
     )
-    stated, noise = known.handle(request), unknown.handle(request)
+    stated, noise = calibrated.handle(request), unknown.handle(request)
     assert stated.quaternion_xyzw == noise.quaternion_xyzw
     # where the calibration is taken for exact, its errors are taken for noise of the stars
     assert stated.sigma_cross_arcsec != noise.sigma_cross_arcsec

@@ -104,7 +104,7 @@ def profile(**keys):
 
 
 @pytest.mark.parametrize(
-    ("keys", "said"),
+    ("keys", "message"),
     [
         ({}, "links.can.address is 4, as in"),
         ({"run": {"clock": "stepped"}}, "heads share a clock"),
@@ -122,11 +122,11 @@ def profile(**keys):
         ),
     ],
 )
-def test_heads_that_exclude_each_other_are_rejected_with_the_key(keys, said):
+def test_heads_that_exclude_each_other_are_rejected_with_the_key(keys, message):
     first = profile(
         links={"serial": {"port": "/dev/ttyUSB0"}, "canopen": {"node": 7}}, run={"state_dir": "/tmp/one"}
     )
-    with pytest.raises(EmulatorError, match=said):
+    with pytest.raises(EmulatorError, match=message):
         check_heads([first, profile(**keys)])
 
 

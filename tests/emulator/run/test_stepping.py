@@ -11,6 +11,8 @@ from starhil.protocol.messages import Request
 from tests.protocol.serial.composed_links import CUBESPACE
 from tests.waiting import until
 
+pytestmark = pytest.mark.long
+
 STEP_S = 30.0
 PEER_BYTES_S = 300_000.0
 """How fast the peer reads, bytes a second: slower than a step sends that does not wait."""

@@ -150,24 +150,24 @@ def test_after_dazzling_stars_are_missing_for_seconds_and_no_attitude_is_wrong(s
             assert not result.valid or (
                 Attitude(np.array(result.quaternion_xyzw)).error_to(truth).total_arcsec < 60.0
             )
-    found = {name: np.array([result.detected for result in each]) for name, each in results.items()}
+    counts = {name: np.array([result.detected for result in each]) for name, each in results.items()}
     assert not any(result.valid for result in results["with"][:2])
-    assert found["with"][2] < 0.7 * found["without"][2]
-    assert (np.diff(found["with"][[2, 3, 4, 6, 8]]) > 0).all()
+    assert counts["with"][2] < 0.7 * counts["without"][2]
+    assert (np.diff(counts["with"][[2, 3, 4, 6, 8]]) > 0).all()
     light = {name: np.array([result.background_dn for result in each]) for name, each in results.items()}
     glow = (light["with"] - light["without"])[2:9]
     assert glow[1:] / glow[:-1] == pytest.approx(math.exp(-0.1 / 0.4), rel=0.05)
-    assert found["with"][35] == pytest.approx(found["without"][35], rel=0.05)
+    assert counts["with"][35] == pytest.approx(counts["without"][35], rel=0.05)
 
 
 def test_images_with_an_afterimage_are_repeated_and_one_that_is_taken_by_itself_has_none(setups):
     sun = {"sun": {"ra_deg": 84.0, "dec_deg": -1.0, "exclusion_deg": 20.0}}
     setup = setups["with"]
-    asked = requests(setup, [ORION] * 4, sun)
+    frame_requests = requests(setup, [ORION] * 4, sun)
     first, again, alone = Pipeline(setup), Pipeline(setup), Pipeline(setup)
-    wanted = [first.handle(request).background_dn for request in asked]
-    assert [again.handle(request).background_dn for request in asked] == wanted
-    bare = alone.handle(replace(asked[2], begin_s=None)).background_dn
+    wanted = [first.handle(request).background_dn for request in frame_requests]
+    assert [again.handle(request).background_dn for request in frame_requests] == wanted
+    bare = alone.handle(replace(frame_requests[2], begin_s=None)).background_dn
     assert wanted[2] > bare + 5.0
-    restarted = [replace(request, pipeline_starts=2) for request in asked[2:3]]
+    restarted = [replace(request, pipeline_starts=2) for request in frame_requests[2:3]]
     assert first.handle(restarted[0]).background_dn == pytest.approx(bare, abs=0.5)

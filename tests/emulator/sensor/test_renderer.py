@@ -67,15 +67,15 @@ def test_noise_of_the_stars_displaces_and_changes_them_as_stated(renderer: Rende
     sky = SkyObjects(star_position_noise_px=2.0, star_magnitude_noise=0.2)
     plain, noisy = renderer.render(ORION), renderer.render(ORION, objects=sky)
     assert np.array_equal(plain.stars.xy_px, noisy.stars.xy_px)  # the truth is that of the catalogue
-    seen = [detect(frame.image) for frame in (plain, noisy)]
-    gaps = np.hypot(*(seen[0].xy_px[:, None] - seen[0].xy_px[None]).T)
+    detections = [detect(frame.image) for frame in (plain, noisy)]
+    gaps = np.hypot(*(detections[0].xy_px[:, None] - detections[0].xy_px[None]).T)
     np.fill_diagonal(gaps, np.inf)
     alone = np.flatnonzero(gaps.min(axis=1) > 40.0)
-    distance = np.hypot(*(seen[0].xy_px[alone, None] - seen[1].xy_px[None]).transpose(2, 0, 1))
+    distance = np.hypot(*(detections[0].xy_px[alone, None] - detections[1].xy_px[None]).transpose(2, 0, 1))
     partner = distance.argmin(axis=1)
-    moved = seen[1].xy_px[partner] - seen[0].xy_px[alone]
+    moved = detections[1].xy_px[partner] - detections[0].xy_px[alone]
     paired = np.hypot(*moved.T) < 12.0
-    change = -2.5 * np.log10(seen[1].flux[partner] / seen[0].flux[alone])[paired]
+    change = -2.5 * np.log10(detections[1].flux[partner] / detections[0].flux[alone])[paired]
     count = np.count_nonzero(paired)
     assert count >= 20
     assert np.std(moved[paired]) == pytest.approx(2.0, rel=4.0 / np.sqrt(4.0 * count))  # four standard errors

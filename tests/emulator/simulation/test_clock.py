@@ -91,11 +91,11 @@ def run_due(scheduler, now_ns):
 
 
 def test_events_come_in_order_of_time_then_of_entry():
-    scheduler, seen = Scheduler(), []
+    scheduler, calls = Scheduler(), []
     for name, due in (("late", 30), ("first", 10), ("second", 10), ("between", 20)):
-        scheduler.at(due, lambda _due, name=name: seen.append(name))
+        scheduler.at(due, lambda _due, name=name: calls.append(name))
     run_due(scheduler, 20)
-    assert seen == ["first", "second", "between"]
+    assert calls == ["first", "second", "between"]
     assert scheduler.next_due_ns() == 30
 
 
@@ -107,9 +107,9 @@ def test_an_event_may_enter_another_that_is_due_at_once():
 
 
 def test_a_cancelled_event_does_nothing():
-    scheduler, seen = Scheduler(), []
-    event = scheduler.at(5, lambda _due: seen.append(1))
+    scheduler, calls = Scheduler(), []
+    event = scheduler.at(5, lambda _due: calls.append(1))
     event.cancel()
     assert scheduler.next_due_ns() is None
     run_due(scheduler, 10)
-    assert seen == []
+    assert calls == []

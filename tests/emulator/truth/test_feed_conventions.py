@@ -152,12 +152,12 @@ def test_a_mount_stays_when_the_truth_changes_without_one(run):
     mount = {"matrix": [[0, 0, -1], [0, 1, 0], [1, 0, 0]]}
 
     async def scenario(emulation, _line):
-        found = []
+        states = []
         async with Control(emulation) as control:
             for truth in ({"kind": "fixed"}, {"kind": "fixed", "mount": {"euler_deg": [0.0, 0.0, 0.0]}}):
                 await control.do("set_truth", truth=truth | {"attitude": {"ra_deg": 0.0, "dec_deg": 0.0}})
-                found.append((await control.do("truth"))["dec_deg"])
-        return found
+                states.append((await control.do("truth"))["dec_deg"])
+        return states
 
     along_x_of_the_body, along_its_z = run(scenario, truth={"kind": "fixed", "mount": mount})
     assert abs(along_x_of_the_body - along_its_z) > 1.0 or along_its_z == pytest.approx(0.0, abs=1e-9)

@@ -142,7 +142,7 @@ def summed(line):
 
 
 @pytest.mark.parametrize(
-    ("changed", "old", "new", "said"),
+    ("changed", "old", "new", "message"),
     [
         (
             0,
@@ -157,12 +157,12 @@ def summed(line):
         (1, "10.82419157", "00.00000000", "mean motion must be a number from 0.01 to 20"),
     ],
 )
-def test_a_tle_whose_columns_are_shifted_is_rejected_though_its_checksum_is_right(changed, old, new, said):
+def test_a_tle_whose_columns_are_shifted_is_rejected_though_its_checksum_is_right(changed, old, new, message):
     """Such orbits were beyond Jupiter, or had no position at all."""
     lines = list(VANGUARD)
     assert old in lines[changed]
     lines[changed] = summed(lines[changed].replace(old, new))
-    with pytest.raises(EmulatorError, match=re.escape(said)):
+    with pytest.raises(EmulatorError, match=re.escape(message)):
         TleOrbit(*lines)
 
 

@@ -139,7 +139,7 @@ CSV = "t,qx,qy,qz,qw,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s\n0,0,0,0,1,{},0,0,0,{},0\n
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (OEM.format(*(7.2e6, 7440.0) * 2), "position and velocity seem to be in metres instead of kilometres"),
         (OEM.format(*(7200.0, 7440.0) * 2), "velocity seems to be in metres per second instead of kilometres per second"),
@@ -147,12 +147,12 @@ CSV = "t,qx,qy,qz,qw,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s\n0,0,0,0,1,{},0,0,0,{},0\n
         (STK.format("DistanceUnit Kilometers\n", *(7.2e6, 7440.0) * 2), "position and velocity seem to be in metres instead of kilometres"),
     ],
 )  # fmt: skip
-def test_an_orbit_file_in_wrong_units_names_file_and_units(tmp_path: Path, text: str, said: str) -> None:
+def test_an_orbit_file_in_wrong_units_names_file_and_units(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "orbit"
     path.write_text(text)
     with pytest.raises(EmulatorError) as error:
         read_orbit_file(path)
-    assert str(error.value) == f"orbit file {path}: {said}"
+    assert str(error.value) == f"orbit file {path}: {message}"
 
 
 def test_positions_of_a_truth_file_in_wrong_units_are_named_by_line(tmp_path: Path) -> None:
@@ -166,7 +166,7 @@ def test_positions_of_a_truth_file_in_wrong_units_are_named_by_line(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("position", "velocity", "said"),
+    ("position", "velocity", "message"),
     [
         (
             [7.2e3, 0.0, 0.0],
@@ -180,11 +180,13 @@ def test_positions_of_a_truth_file_in_wrong_units_are_named_by_line(tmp_path: Pa
         ),
     ],
 )
-def test_a_state_of_a_profile_in_wrong_units_is_named(position, velocity, said: str, tmp_path: Path) -> None:
+def test_a_state_of_a_profile_in_wrong_units_is_named(
+    position, velocity, message: str, tmp_path: Path
+) -> None:
     config = StateConfig(kind="state", position_m=position, velocity_m_s=velocity)
     with pytest.raises(EmulatorError) as error:
         config.build(RUN, tmp_path)
-    assert str(error.value) == f"orbit: {said}"
+    assert str(error.value) == f"orbit: {message}"
 
 
 def test_the_status_shows_a_feed_of_another_date(run) -> None:
@@ -195,3 +197,57 @@ def test_the_status_shows_a_feed_of_another_date(run) -> None:
             return await control.do("status")
 
     assert run(scenario, truth={"kind": "live"})["truth_status"] == "implausible"
+
+
+def in_orbit(t: float) -> list[float]:
+    """Position and velocity of a circular orbit of 7000 km, km and km/s."""
+    angle = 1.078e-3 * t
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return [7000.0 * cosine, 7000.0 * sine, 0.0, -7.546 * sine, 7.546 * cosine, 0.0]
+
+
+OEM_HEADER = (
+    "CCSDS_OEM_VERS = 2.0\nMETA_START\nCENTER_NAME = EARTH\nREF_FRAME = ICRF\nTIME_SYSTEM = UTC\nMETA_STOP\n"
+)
+CSV_HEADER = "t,qx,qy,qz,qw,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s\n"
+
+
+def test_a_wrong_sign_in_one_row_of_an_orbit_shows_between_the_rows(tmp_path: Path) -> None:
+    """Between them the satellite had 340 km/s, and its aberration was wrong by four minutes of arc."""
+    path = tmp_path / "file"
+    for wrong in (False, True):
+        rows = [in_orbit(60.0 * n) for n in range(6)]
+        if wrong:
+            rows[3][0] *= -1.0
+        oem = [f"2026-01-01T00:0{n}:00 " + " ".join(map(repr, row)) for n, row in enumerate(rows)]
+        csv = [
+            ",".join(map(repr, [60.0 * n, 0, 0, 0, 1, *(1e3 * x for x in row)])) for n, row in enumerate(rows)
+        ]
+        for header, lines, read, where in (
+            (OEM_HEADER, oem, read_orbit_file, "orbit file .*: row 3: "),
+            (CSV_HEADER, csv, read_truth_file, "truth file .* line 4: "),
+        ):
+            path.write_text(header + "\n".join(lines))
+            if wrong:
+                with pytest.raises(
+                    EmulatorError, match=where + ".*halfway to the next row: a number is wrong"
+                ):
+                    read(path)
+            else:
+                read(path)
+
+
+def test_rows_between_which_a_satellite_goes_most_of_the_way_around_are_too_far_apart(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    for hours, enough in ((0.5, True), (1.0, False)):
+        rows = [
+            f"2026-01-01T{int(hours * n):02d}:{round(60 * hours * n) % 60:02d}:00 "
+            + " ".join(map(repr, in_orbit(3600.0 * hours * n)))
+            for n in range(4)
+        ]
+        path.write_text(OEM_HEADER + "\n".join(rows))
+        if enough:
+            read_orbit_file(path)
+        else:
+            with pytest.raises(EmulatorError, match="rows are too far apart"):
+                read_orbit_file(path)

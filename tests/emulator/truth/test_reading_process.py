@@ -34,6 +34,8 @@ from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.truth.test_standard_files import aem
 from tests.waiting import until, wait_until
 
+pytestmark = pytest.mark.long
+
 CSV = "t,qx,qy,qz,qw,wx_deg_s,wy_deg_s,wz_deg_s,x_m,y_m,z_m,vx_m_s,vy_m_s,vz_m_s\n" + "".join(
     f"{t},0,0,{np.sin(0.01 * t)},{np.cos(0.01 * t)},0,0,{np.degrees(0.02)},7e6,{t},0,0,7500,0\n"
     for t in range(20)

@@ -41,12 +41,12 @@ def row(start: Attitude, t: float, *, rates: bool = True) -> str:
 
 
 def segment(start: Attitude, times: range, *, rates: bool = True, **keywords: str) -> str:
-    given = {
+    segments = {
         "REF_FRAME_A": "ICRF", "REF_FRAME_B": "BODY", "TIME_SYSTEM": "UTC",
         "ATTITUDE_TYPE": "QUATERNION/ANGVEL" if rates else "QUATERNION", **({"ANGVEL_FRAME": "BODY"} if rates else {}),
         **keywords,
     }  # fmt: skip
-    meta = [f"{key} = {value}" for key, value in given.items() if value]
+    meta = [f"{key} = {value}" for key, value in segments.items() if value]
     rows = [f"{date(t)} {row(start, t, rates=rates)}" for t in times]
     return "\n".join(("META_START", *meta, "META_STOP", "DATA_START", *rows, "DATA_STOP", ""))
 
@@ -95,7 +95,7 @@ def test_the_first_useable_time_is_time_zero_and_after_the_last_the_attitude_is_
 
 
 @pytest.mark.parametrize(
-    ("useable", "said"),
+    ("useable", "message"),
     [
         (
             ({}, {}),
@@ -112,11 +112,11 @@ def test_the_first_useable_time_is_time_zero_and_after_the_last_the_attitude_is_
         ),
     ],
 )
-def test_spans_that_overlap_or_are_empty_are_named(tmp_path: Path, useable, said: str) -> None:
+def test_spans_that_overlap_or_are_empty_are_named(tmp_path: Path, useable, message: str) -> None:
     parts = (segment(BEFORE, range(21), **useable[0]), segment(AFTER, range(15, 41), **useable[1]))
     with pytest.raises(EmulatorError) as error:
         read_truth_file(write(tmp_path, *parts))
-    assert said in str(error.value)
+    assert message in str(error.value)
 
 
 # --- gaps ---
@@ -186,7 +186,7 @@ def test_a_repeated_file_repeats_its_gap(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("keywords", "said"),
+    ("keywords", "message"),
     [
         ({"QUATERNION_TYPE": "LAST"}, "segment 1: ATTITUDE_DIR is missing"),
         ({"ATTITUDE_DIR": "A2B"}, "segment 1: QUATERNION_TYPE is missing"),
@@ -194,11 +194,11 @@ def test_a_repeated_file_repeats_its_gap(tmp_path: Path) -> None:
         ({"ATTITUDE_DIR": "A2B", "QUATERNION_TYPE": "4"}, "segment 1: QUATERNION_TYPE must be LAST or FIRST"),
     ],
 )
-def test_an_aem_of_version_1_says_direction_and_order(tmp_path: Path, keywords, said: str) -> None:
+def test_an_aem_of_version_1_says_direction_and_order(tmp_path: Path, keywords, message: str) -> None:
     path = write(tmp_path, segment(BEFORE, range(3), rates=False, **keywords), version="1.0")
     with pytest.raises(EmulatorError) as error:
         read_truth_file(path)
-    assert str(error.value) == f"truth file {path}, {said}"
+    assert str(error.value) == f"truth file {path}, {message}"
 
 
 def test_attitudes_without_rates_are_named_as_unchecked(tmp_path: Path, caplog) -> None:

@@ -241,16 +241,16 @@ def test_a_42_that_comes_later_is_connected_to(run, caplog, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("truth", "clock", "said"),
+    ("truth", "clock", "message"),
     [
         ({"kind": "live", "lockstep": True}, "stepped", 'lockstep needs protocol = "tcp"'),
         ({"kind": "live", "lockstep": True, "protocol": "tcp"}, "real", "run with --clock stepped"),
         ({"kind": "42", "port": 0}, "stepped", 'port: 0 needs role = "server"'),
     ],
 )
-def test_settings_that_cannot_work_are_rejected_with_the_remedy(run, truth, clock, said):
+def test_settings_that_cannot_work_are_rejected_with_the_remedy(run, truth, clock, message):
     async def scenario(_emulation, _line):
         raise AssertionError
 
-    with pytest.raises((EmulatorError, ValueError), match=said):
+    with pytest.raises((EmulatorError, ValueError), match=message):
         run(scenario, clock=clock, truth=truth)

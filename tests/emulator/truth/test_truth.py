@@ -139,49 +139,9 @@ def test_file_takes_angles_rates_and_repeats(tmp_path):
     assert np.degrees(truth.state(5.0).rate_rad_s) == pytest.approx([1.5, 2.0, 2.5])
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "empty"),
-        ("t,qx,qy,qz,qw\n", "no rows"),
-        ("t,qx,qy,qz\n0,0,0,0\n", "line 1"),
-        ("t,qx,qy,qz,qw,colour\n0,0,0,0,1,3\n", "line 1: column 6 is unknown"),
-        ("t,qx,qy,qz,qw\n0,0,0,0,1\n1,0,0,x,1\n", "line 3: qz is not a number"),
-        ("t,qx,qy,qz,qw\n0,0,0,0,1\n# c\n1,0,0,1\n", "line 4: 4 values for 5 columns"),
-        ("t,qx,qy,qz,qw\n0,0,0,0,1\n0,0,0,0,1\n", "line 3: t is not later"),
-        ("t,qx,qy,qz,qw\n0,0,0,0,1\n1e-320,0,0,1,0\n", "line 3: t is not later"),
-        ("t,qx,qy,qz,qw\n0,0,0,0,2\n", "line 2: the quaternion is not of length 1"),
-        ("t,qx,qy,qz,qw\n0,0,0,0,nan\n", "line 2: qw is not a number"),
-        ("t,ra_deg,dec_deg,roll_deg\n0,0,91,0\n", "line 2: dec_deg is outside"),
-        (
-            "t,qx,qy,qz,qw\n0,0,0,0,1\n0.001,1,0,0,0\n",
-            "line 3: the rotation from the previous row is faster than 600",
-        ),
-        ("t,qx,qy,qz,qw\n0,0,0,0,1_0\n", "line 2: qw is not a number"),
-        ("t,ra_deg,dec_deg,roll_deg\n0,1e300,0,0\n", "line 2: ra_deg is outside ±1e+06"),
-        ("t,ra_deg,dec_deg,roll_deg\n0,0,0,1e999\n", "line 2: roll_deg is not a number"),
-        ("t,ra_deg,dec_deg,roll_deg\n1e300,0,0,0\n", "line 2: t is outside ±1e+09"),
-        (
-            "t,qx,qy,qz,qw,wx_deg_s,wy_deg_s,wz_deg_s\n0,0,0,0,1,0,0,601\n",
-            "line 2: wz_deg_s is outside ±600",
-        ),
-        (
-            "t,qx,qy,qz,qw,ra_deg,dec_deg,roll_deg\n0,0,0,0,1,0,0,0\n",
-            "line 1: columns qx, qy, qz, qw and ra_deg, dec_deg, roll_deg both give the attitude",
-        ),
-        ("t,qx,qy,qz,qw,roll_deg\n0,0,0,0,1,0\n", "line 1: columns qx, qy, qz, qw and roll_deg both give"),
-        ("# c\nt,t,qx,qy,qz,qw\n0,1,0,0,0,1\n", "line 2: column t appears twice"),
-        ("t,qx,qy,qz,qw,wx_deg_s,wz_deg_s\n0,0,0,0,1,3,3\n", "line 1: column wy_deg_s is missing"),
-        ("t,qx,qy,qz,qw\n0,0,0,0," + "1" * 200_000 + "\n", "line 2: not CSV"),
-    ],
-)
-def test_bad_files_are_named_by_line(tmp_path, text, said):
-    path = write(tmp_path, text)
-    with pytest.raises(EmulatorError) as refusal:
-        read_truth_file(path)
-    assert said in str(refusal.value)
-    assert str(path) in str(refusal.value)
-    assert "\n" not in str(refusal.value)
+def test_a_cell_of_200000_digits_is_rejected_by_line(tmp_path):
+    with pytest.raises(EmulatorError, match=r"truth\.csv line 2: not CSV"):
+        read_truth_file(write(tmp_path, "t,qx,qy,qz,qw\n0,0,0,0," + "1" * 200_000 + "\n"))
 
 
 SECRET = "s3cr3t"
@@ -286,31 +246,11 @@ def test_live_feed_on_simulation_time_uses_message_times_unchanged():
     assert live.state(10.0).status is TruthStatus.OK
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("nonsense", "JSON"),
-        ("[1]", "object"),
-        ('{"q":[0,0,0,1],"t":1,"t":2}', "key 't' is repeated"),
-        ("{}", "q is missing"),
-        ('{"q":[0,0,0,1],"w":1}', "unknown key 'w'"),
-        ('{"q":[0,0,0]}', "q is not 4 numbers"),
-        ('{"q":[0,0,0,"1"]}', "finite number"),
-        ('{"q":[0,0,0,NaN]}', "finite number"),
-        ('{"q":[0,0,0,true]}', "finite number"),
-        ('{"q":[0,0,0,2]}', "length 1"),
-        ('{"q":[0,0,0,1],"rate":[1,2]}', "rate is not 3 numbers"),
-        ('{"q":[0,0,0,1],"t":"x"}', "t: 'x' is not"),
-        ('{"q":[0,0,0,1],"t":1e999}', "t: inf is not"),
-        ('{"q": [0, 0, 0, 1], "rate": [0, 1e9, 0]}', "rate exceeds 600"),
-    ],
-)
-def test_bad_messages_are_counted_and_named_and_change_nothing(text, said):
+def test_a_bad_message_is_counted_and_changes_nothing():
     live = LiveTruth(EAST)
     live.receive(line(0.0, ORION), 0.0)
-    assert not live.receive(text, 0.5)
+    assert not live.receive("{}", 0.5)
     assert (live.accepted, live.refused) == (1, 1)
-    assert said in live.last_fault
     assert apart_arcsec(live.state(0.0).attitude, ORION) < MILLIARCSECOND
 
 

@@ -178,16 +178,16 @@ class AlbertaSat:
     def file_list(self) -> list[FileInfo]:
         """`ADCS_get_file_list`."""
         assert self.telecommand(118) == 0
-        found: list[FileInfo] = []
+        files: list[FileInfo] = []
         for _ in range(NEVER):
             info = FileInfo.of(self.telemetry(243, 12))
             if info.updating:
                 self.uart.wait(0.005)
                 continue
             if (info.counter, info.size, info.time, info.crc) == (0, 0, 0, 0):
-                return found
+                return files
             assert self.telecommand(113) == 0
-            found.append(info)
+            files.append(info)
         pytest.fail("the file list never ends")
 
     def download(self, info: FileInfo) -> bytes:
@@ -254,15 +254,15 @@ class EnduroSat:
 
     def file_list(self) -> list[FileInfo]:
         assert self.telecommand(118) == 0
-        found: list[FileInfo] = []
+        files: list[FileInfo] = []
         for _ in range(NEVER):
             info = FileInfo.of(self.fetch(243, 12))
             if info.updating:
                 self.uart.wait(0.01)
                 continue
             if info.time == 0 and info.size == 0:
-                return found
-            found.append(info)
+                return files
+            files.append(info)
             assert self.telecommand(113) == 0
         pytest.fail("the file list never ends")
 
@@ -338,15 +338,15 @@ class Cts:
         """`ADCS_get_sd_card_file_list`: fixed pauses instead of the flag."""
         assert self.telecommand(118) == 0
         self.unit.step(0.2)
-        found = []
+        blocks = []
         for _ in range(20):
             info = FileInfo.of(self.telemetry(243, 12))
             if (info.crc, info.time, info.size) == (0, 0, 0):
                 break
-            found.append(info)
+            blocks.append(info)
             assert self.telecommand(113) == 0
             self.unit.step(0.1)
-        return found
+        return blocks
 
     def download(self, info: FileInfo) -> bytes:
         """`ADCS_load_sd_file_block_to_filesystem`: 1024 as the length of a block, and 1024 readings of row 241."""
@@ -357,14 +357,14 @@ class Cts:
             assert self.telemetry(242, 5)[0] & 1
             assert self.telecommand(119, bytes((20, 1))) == 0
             self.unit.step(0.1)
-            buffer, seen = bytearray(BLOCK), set()
+            buffer, numbers = bytearray(BLOCK), set()
             for _ in range(1024):
                 packet = self.telemetry(241, 22)
                 number = int.from_bytes(packet[:2], "little") % 1024
                 buffer[20 * number : 20 * number + 20] = packet[2:]
-                seen.add(number)
+                numbers.add(number)
             left = min(BLOCK, info.size - block * BLOCK)
-            assert len(seen) <= -(
+            assert len(numbers) <= -(
                 -left // 20
             )  # more packets than expected, and it asks again until it gives up
             file += buffer[:left]

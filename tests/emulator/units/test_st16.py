@@ -40,13 +40,13 @@ def message(command: int, data: bytes = b"") -> bytes:
 
 def replies(unit: Emulated, command: int, data: bytes = b"") -> list[tuple[int, bytes]]:
     """Return control field and data of each reply; address and CRC are verified."""
-    found = []
+    frames = []
     for body in unslip(unit.ask(message(command, data))):
         assert struct.unpack("<H", body[-2:])[0] == crc16(body[:-2])
         assert body[:2] == bytes([HOST, TRACKER])
         assert body[2] & 0x1F == command
-        found.append((body[2], body[3:-2]))
-    return found
+        frames.append((body[2], body[3:-2]))
+    return frames
 
 
 def answer(unit: Emulated, command: int, data: bytes = b"") -> bytes:

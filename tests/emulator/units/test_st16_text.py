@@ -40,12 +40,12 @@ def sent(control: int, data: bytes = b"") -> bytes:
 
 def messages(line: bytes) -> list[tuple[int, bytes]]:
     """Return control field and data of each message, whose addresses and CRC must be right."""
-    found = []
+    lines = []
     for body in unslip(line):
         assert body[:2] == bytes((OBC, TRACKER))
         assert struct.unpack("<H", body[-2:])[0] == crc16(body[:-2])
-        found.append((body[2], body[3:-2]))
-    return found
+        lines.append((body[2], body[3:-2]))
+    return lines
 
 
 def asked(unit: Emulated, code: int, data: bytes = b"") -> bytes:
@@ -201,12 +201,12 @@ def test_time_is_48_bits_of_microseconds():  # 35918
 
 def test_the_lowest_bit_of_time_is_zero():  # 35918
     def scenario(unit: Emulated) -> None:
-        seen = set()
+        states = set()
         for _ in range(8):
             unit.step(1e-6)
-            seen.add(int.from_bytes(asked(unit, TIME), "little"))
-        assert len(seen) > 1
-        assert all(count % 2 == 0 for count in seen)
+            states.add(int.from_bytes(asked(unit, TIME), "little"))
+        assert len(states) > 1
+        assert all(count % 2 == 0 for count in states)
 
     with_unit("st16", "serial", scenario)
 

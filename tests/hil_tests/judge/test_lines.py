@@ -58,12 +58,12 @@ def test_both_sides_of_the_line_agree_with_the_product(name, dialect):
     icd, unit = DEFINITIONS[name]
     stack, line, rng = SerialStack(icd), SerialLine(unit, dialect), random.Random(5)
     style = None if line.dialect is None else Dialect(line.dialect)
-    for row, known in zip(unit.rows, icd.rows, strict=True):
+    for row, original in zip(unit.rows, icd.rows, strict=True):
         if row.name in unit.unanswered or row.answers == ("echo",):
             continue
         data = rng.randbytes(row.size)
         request = unit.request(row, b"" if row.is_telemetry else data)
-        assert line.encode(request) == stack.encode_request(icd.request(known, request.data)), row
+        assert line.encode(request) == stack.encode_request(icd.request(original, request.data)), row
         kind = ReplyKind.TELEMETRY if row.is_telemetry else ReplyKind.ACK
         sent = stack.encode_reply(
             Reply(kind, row.id, data if row.is_telemetry else b"", message_class=row.message_class), style

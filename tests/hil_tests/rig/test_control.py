@@ -30,13 +30,13 @@ def channel():
     with ExitStack() as servers:
 
         def serve(answer: Answer, path: Path | None = None) -> tuple[list[dict], str]:
-            asked: list[dict] = []
+            requests: list[dict] = []
 
             class Handler(socketserver.StreamRequestHandler):
                 def handle(self) -> None:
                     for line in self.rfile:
-                        asked.append(json.loads(line))
-                        if (reply := answer(asked[-1])) is None:
+                        requests.append(json.loads(line))
+                        if (reply := answer(requests[-1])) is None:
                             return
                         self.wfile.write(json.dumps(reply).encode() + b"\n")
 
@@ -51,7 +51,7 @@ def channel():
             thread.start()
             servers.callback(thread.join)
             servers.callback(server.shutdown)
-            return asked, address
+            return requests, address
 
         yield serve
 
@@ -112,16 +112,16 @@ def test_a_reset_ends_when_the_device_has_booted_which_takes_steps_of_a_stepped_
             {"ok": True, "clock": clock, "mode": next(modes)} if request["do"] == "status" else {"ok": True}
         )
 
-    asked, address = channel(answer)
+    requests, address = channel(answer)
     with ControlClient(address) as client:
         client.reset()
-    assert [request["do"] for request in asked] == [
+    assert [request["do"] for request in requests] == [
         "clear_faults",
         "set_truth",
         "fault",
         *["status"] * polls,
     ]
-    assert asked[2]["device"] == {"reset": "power_on"}
+    assert requests[2]["device"] == {"reset": "power_on"}
 
 
 def test_a_device_that_does_not_boot_is_reported(channel, monkeypatch):
@@ -132,13 +132,13 @@ def test_a_device_that_does_not_boot_is_reported(channel, monkeypatch):
 
 
 def test_the_truth_is_set_and_read_at_a_time(channel):
-    asked, address = channel(lambda _request: {"ok": True, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]})
+    requests, address = channel(lambda _request: {"ok": True, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]})
     with ControlClient(address) as client:
         truth = Truth(client, Conventions())
         truth.point(83.8, -1.2, 30.0)
         assert truth.error([0.0, 0.0, 0.0, 1.0], 5.0).total_arcsec == 0.0
     attitude = {"ra_deg": 83.8, "dec_deg": -1.2, "roll_deg": 30.0}
-    assert asked == [
+    assert requests == [
         {"do": "set_truth", "truth": {"kind": "fixed", "attitude": attitude}},
         {"do": "truth", "unix_s": 5.0},
     ]

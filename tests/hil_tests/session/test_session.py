@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
 import signal
@@ -24,7 +25,7 @@ from starhil.hil_tests.session import SessionRequest, run_session
 from starhil.hil_tests.session.results import junit_cases
 from starhil.hil_tests.session.script import load_script
 from starhil.hil_tests.session.session import run_steps
-from starhil.hil_tests.session.session_run import _emulator, _print_result
+from starhil.hil_tests.session.session_run import _emulator, _print_result, _running_step
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.unit import load_unit
 from starid.errors import StaridError
@@ -104,6 +105,17 @@ def test_a_message_uses_one_time_unit(play, device, capsys):
     line = capsys.readouterr().out
     assert " s" in line
     assert " ms" not in line
+
+
+def test_the_running_step_is_shown_on_a_terminal_alone():
+    for is_terminal in (True, False):
+        console = Console(file=io.StringIO(), force_terminal=is_terminal, highlight=False, width=60)
+        with _running_step(console) as begun:
+            begun(4, "sample [green] attitude")
+            console.print("a result above it")
+        shown = re.sub(r"\x1b\[[0-9;]*m", "", console.file.getvalue())
+        assert "a result above it" in shown
+        assert ("…   4  sample [green] attitude 0:00:00" in shown) is is_terminal
 
 
 def attitude_values(dec_offset_arcsec: float = 0.0, **more) -> dict:
@@ -276,11 +288,11 @@ def test_the_truth_of_a_script_points_the_emulator_that_is_started(own, tmp_path
     )
     options = LinkOptions(serial="auto")
     emulator = _emulator(SessionRequest(path, options), load_script(path, ICD), options, tmp_path, tmp_path)
-    given = [setting for option, setting in pairwise(emulator.command) if option == "--set"]
+    settings = [setting for option, setting in pairwise(emulator.command) if option == "--set"]
     if own:  # settings of the script's own go before
-        assert given == [own]
+        assert settings == [own]
         return
-    attitude = load_profile("cubestar", given).truth.attitude.build()
+    attitude = load_profile("cubestar", settings).truth.attitude.build()
     assert (
         attitude_error(
             unit(attitude.quaternion_xyzw.tolist()), from_radec_roll(201.3, -11.2, 5.0)

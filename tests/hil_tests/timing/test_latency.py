@@ -67,13 +67,13 @@ def processes(monkeypatch, device, hub):
 @pytest.mark.process
 def test_each_link_is_measured_at_each_rate_without_and_with_viewers(processes):
     _, started, viewers = processes
-    said = []
-    rows, process = measure("cubestar", [0.0, 5.0], 0.2, "thread", said.append, viewers=2)
+    lines = []
+    rows, process = measure("cubestar", [0.0, 5.0], 0.2, "thread", lines.append, viewers=2)
     links = ("serial", "can", "echo")
     assert [(row.update_rate_hz, row.viewers, row.link) for row in rows] == [
         (rate, count, link) for rate in (0.0, 5.0) for count in (0, 2) for link in links
     ]
-    assert said == ["thread: 0 Hz", "thread: 5 Hz"]
+    assert lines == ["thread: 0 Hz", "thread: 5 Hz"]
     for row in rows:
         assert (row.worker, row.lost) == ("thread", 0)
         assert row.requests > 0
@@ -146,19 +146,19 @@ def test_an_echo_that_does_not_come_is_infinite(monkeypatch):
 
 
 def test_peers_are_asked_in_turn_with_the_same_rows():
-    asked = []
+    rows = []
 
     def peer(name):
         async def ask(row):
-            asked.append((name, row))
-            return float(len(asked))
+            rows.append((name, row))
+            return float(len(rows))
 
         return ask
 
     found = asyncio.run(ask_in_turn({"one": peer("one"), "two": peer("two")}, ["a", "b", "c"], 0.1))
-    assert asked[:8] == [(name, row) for row in "abca" for name in ("one", "two")]
+    assert rows[:8] == [(name, row) for row in "abca" for name in ("one", "two")]
     assert found["one"][:4] == [1.0, 3.0, 5.0, 7.0]
-    assert len(found["one"]) == len(found["two"]) == len(asked) / 2
+    assert len(found["one"]) == len(found["two"]) == len(rows) / 2
 
 
 def test_viewers_end_with_the_measurement():
@@ -168,12 +168,12 @@ def test_viewers_end_with_the_measurement():
 
 
 def test_a_viewer_subscribes_as_a_page_and_reads_until_the_console_ends():
-    asked = []
+    commands = []
 
     async def serve(request):
         socket = web.WebSocketResponse()
         await socket.prepare(request)
-        asked.append((request.query["token"], await socket.receive_json()))
+        commands.append((request.query["token"], await socket.receive_json()))
         await socket.send_str("{}")
         await socket.send_bytes(bytes(100))
         await socket.close()
@@ -191,4 +191,4 @@ def test_a_viewer_subscribes_as_a_page_and_reads_until_the_console_ends():
         await runner.cleanup()
 
     asyncio.run(main())
-    assert asked == [("abc", {"id": 1, "do": "subscribe", "frames": True, "rows": list(ROWS)})]
+    assert commands == [("abc", {"id": 1, "do": "subscribe", "frames": True, "rows": list(ROWS)})]

@@ -123,7 +123,7 @@ def test_inquire_identity(bench, command, number):
 
 
 @pytest.mark.parametrize(
-    ("ranges", "found"),
+    ("ranges", "is_answered"),
     [
         ((VENDOR, PRODUCT, REVISION, REVISION, SERIAL, SERIAL), True),
         ((VENDOR, PRODUCT, 0, 0xFFFFFFFF, 0, 0xFFFFFFFF), True),
@@ -133,13 +133,13 @@ def test_inquire_identity(bench, command, number):
         ((VENDOR + 1, PRODUCT, 0, 0xFFFFFFFF, 0, 0xFFFFFFFF), False),
     ],
 )
-def test_identify_remote_slave(bench, ranges, found):
+def test_identify_remote_slave(bench, ranges, is_answered):
     answers = [
         answer
         for step, number in enumerate(ranges)
         for answer in lss(bench, bytes([0x46 + step]) + number.to_bytes(4, "little"))
     ]
-    assert answers == (["4f00000000000000"] if found else [])
+    assert answers == (["4f00000000000000"] if is_answered else [])
 
 
 @pytest.mark.parametrize(

@@ -413,15 +413,15 @@ def test_attitude_pdos_share_sequence_and_flags(bench, kind):
     for index in (0x1801, 0x1802, 0x1803):
         assert bench.write(index, 2, kind, 1) == 0
     bench.operational()
-    asked = []
+    indices = []
 
     def telemetry(row):
-        asked.append(row.name)
-        return row.encode(attitude(len(asked)) if row.name == "precise_attitude" else {})
+        indices.append(row.name)
+        return row.encode(attitude(len(indices)) if row.name == "precise_attitude" else {})
 
     bench.application.telemetry = telemetry
     frames = notify(bench, "precise_attitude") if kind == 254 else sync(bench)
-    assert asked == ["precise_attitude"]  # one sample for all of them
+    assert indices == ["precise_attitude"]  # one sample for all of them
     time, first, second = (data for identifier, data in frames if identifier in {0x2AC, 0x3AC, 0x4AC})
     assert time[:2] == first[:2] == second[:2] == b"\x01\x01"
     assert int.from_bytes(time[2:], "little") / 65536 == 1_800_000_001.5

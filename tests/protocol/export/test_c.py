@@ -185,15 +185,15 @@ def test_a_request_on_can_has_as_many_frames_as_its_counter_allows(c: CDriver) -
 def can_events(frames: list[CanFrame]) -> list[list[str]]:
     """What our receiver of the OBC's side makes of each frame, as the program prints it, and of the silence after them."""
     receiver = CanHostReceiver(1, 4)
-    found = []
+    values = []
     for frame in frames:
         events = receiver.feed(frame, 0.0)
         messages = [event for event in events if not isinstance(event, LinkFault)]
         words = [FAULT, "0", "0", "-"] if events else []
         for event in messages:
             words = [KINDS.index(event.kind.value), event.id, int(event.code), hex_or_none(event.data)]
-        found.append([str(word) for word in words])
-    return [*found, [FAULT] if receiver.flush(1.0) else ["0"]]
+        values.append([str(word) for word in words])
+    return [*values, [FAULT] if receiver.flush(1.0) else ["0"]]
 
 
 def test_the_receiver_of_the_c_reads_can_as_ours(c: CDriver) -> None:

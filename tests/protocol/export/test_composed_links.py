@@ -73,12 +73,12 @@ def test_every_reply_is_read_in_pieces_of_any_size_and_amid_noise(name: str) -> 
             sent = (b"" if stack.requests.framing.start else stack.requests.framing.end) + stack.encode_reply(
                 reply
             )
-            found = [
+            lines = [
                 message
                 for start in range(0, len(noise + sent), piece)
                 for message in link.receive((noise + sent)[start : start + piece])
             ]
-            assert found == [expected(stack, reply)]
+            assert lines == [expected(stack, reply)]
 
 
 @pytest.mark.parametrize("name", REPLIES)

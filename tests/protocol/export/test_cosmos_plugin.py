@@ -28,13 +28,13 @@ def protocol(folder: Path, dialect: Dialect) -> Any:
 
 def read(link: Any, data: bytes, piece: int = 7) -> list[bytes]:
     """Return the packets that COSMOS gets from bytes that come in pieces."""
-    found = []
+    packets = []
     for start in range(0, len(data), piece):
         packet, _ = link.read_data(data[start : start + piece])
         while packet != "STOP":
-            found.append(packet)
+            packets.append(packet)
             packet, _ = link.read_data(b"")
-    return found
+    return packets
 
 
 @pytest.mark.parametrize("dialect", Dialect)

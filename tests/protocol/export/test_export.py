@@ -293,20 +293,20 @@ def test_cosmos_makes_our_telecommands(folder: Path) -> None:
 
 
 def test_the_cosmos_text_has_every_row_once_and_no_overlap() -> None:
-    seen: dict[str, list[tuple[int, int]]] = {}
+    bits: dict[str, list[tuple[int, int]]] = {}
     current = ""
     for line in text("cosmos").splitlines():
         if match := re.match(r"(?:COMMAND|TELEMETRY) STARHIL (\w+) ", line):
             current = match[1].lower()
-            assert current not in seen
-            seen[current] = []
+            assert current not in bits
+            bits[current] = []
         elif match := re.match(r"  (?:PARAMETER|ITEM) (\w+) (\d+) (\d+) ", line):
-            seen[current].append((int(match[2]), int(match[3])))
-    assert seen.keys() == {row.name for row in ICD.rows} | {f"request_{row.name}" for row in TELEMETRY}
+            bits[current].append((int(match[2]), int(match[3])))
+    assert bits.keys() == {row.name for row in ICD.rows} | {f"request_{row.name}" for row in TELEMETRY}
     for row in TELEMETRY:
-        assert seen[f"request_{row.name}"] == []
+        assert bits[f"request_{row.name}"] == []
     for row in ICD.rows:
-        places = sorted(seen[row.name])
+        places = sorted(bits[row.name])
         assert sum(size for _, size in places) == 8 * row.size
         assert all(a + size == b for (a, size), (b, _) in pairwise(places))
 
@@ -380,11 +380,15 @@ def test_human_readable_exports_contain_parameters_and_enumerations(name: str) -
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "eds"])
 def test_every_export_states_how_out_of_range_numbers_are_sent(name: str) -> None:
     """Rates are clipped, counters wrap; a telecommand's field is refused, which needs no word a field."""
-    said = text(name)
+    document = text(name)
     assert re.search(
-        r"rate_x.*-3\.2768 to 3\.2767.*clipped|rate_x.*[Cc]lipped to -3\.2768 to 3\.2767", said, re.IGNORECASE
+        r"rate_x.*-3\.2768 to 3\.2767.*clipped|rate_x.*[Cc]lipped to -3\.2768 to 3\.2767",
+        document,
+        re.IGNORECASE,
     )
-    assert re.search(r"runtime_s.*0 to 65535.*wraps|runtime_s.*[Ww]raps beyond 65535", said, re.IGNORECASE)
+    assert re.search(
+        r"runtime_s.*0 to 65535.*wraps|runtime_s.*[Ww]raps beyond 65535", document, re.IGNORECASE
+    )
 
 
 def test_markdown_gives_the_range_of_every_integer_in_telemetry() -> None:
@@ -503,13 +507,13 @@ def test_cosmos_names_fields_without_a_description(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", bundled_units())
 def test_example_messages_decode_to_the_values_that_are_printed(name: str) -> None:
     icd = load_unit(name)
-    said = export(icd, "markdown")
-    described = re.findall(r"^### .*\) (\w+)", said, re.MULTILINE)
+    document = export(icd, "markdown")
+    described = re.findall(r"^### .*\) (\w+)", document, re.MULTILINE)
     for exchange in exchanges(icd):
         row = exchange.row
         answers = [answer for answer in row.answers if answer != "echo"]
         if row.name in described:
-            assert example_text(exchange) in said
+            assert example_text(exchange) in document
         if (
             row.kind == "telecommand"
             or answers != ["reply"]

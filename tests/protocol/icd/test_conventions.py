@@ -62,14 +62,14 @@ def test_the_example_is_the_attitude_that_it_names():
 
 
 def test_the_quaternion_turns_vectors_into_the_sensor_frame():
-    v, seen = numbers(EXAMPLE["v, Betelgeuse in ICRS"]), numbers(EXAMPLE["v_sensor"])
+    v, v_sensor = numbers(EXAMPLE["v, Betelgeuse in ICRS"]), numbers(EXAMPLE["v_sensor"])
     turned = hamilton(hamilton(Q, np.append(v, 0.0)), Q * [-1.0, -1.0, -1.0, 1.0])
     assert v == pytest.approx(direction(88.792939, 7.407064), abs=DIGITS)
-    assert turned[:3] == pytest.approx(seen, abs=4 * DIGITS)
-    assert MATRIX @ v == pytest.approx(seen, abs=4 * DIGITS)
-    assert Rotation.from_quat(Q).apply(v) == pytest.approx(seen, abs=4 * DIGITS)
+    assert turned[:3] == pytest.approx(v_sensor, abs=4 * DIGITS)
+    assert MATRIX @ v == pytest.approx(v_sensor, abs=4 * DIGITS)
+    assert Rotation.from_quat(Q).apply(v) == pytest.approx(v_sensor, abs=4 * DIGITS)
     place = numbers(EXAMPLE["its position in the image"])
-    assert 468.0 + 1220.4842 * seen[:2] / seen[2] == pytest.approx(place, abs=0.006)
+    assert 468.0 + 1220.4842 * v_sensor[:2] / v_sensor[2] == pytest.approx(place, abs=0.006)
 
 
 def test_the_formulas_of_the_matrix_give_its_rows():
@@ -117,11 +117,11 @@ def test_a_matrix_becomes_the_quaternion():
 
 @pytest.mark.parametrize("name", ["markdown", "html"])
 def test_human_readable_exports_contain_the_convention(name):
-    said = export(ICD, name)
+    document = export(ICD, name)
     for section in ICD.sections:
-        assert section.heading in said
+        assert section.heading in document
         for cell in (cell for row in section.rows for cell in row if re.fullmatch(r"[-0-9., ]+", cell)):
-            assert cell in said
+            assert cell in document
 
 
 def test_an_unknown_key_hides_what_it_may_cause(tmp_path):

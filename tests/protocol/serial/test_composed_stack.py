@@ -122,13 +122,13 @@ def test_the_device_reads_requests_in_pieces_of_any_size(name: str, request_: Re
 def test_the_host_reads_replies(name: str, reply: Reply) -> None:
     receiver = STACKS[name].host()
     sent = STACKS[name].encode_reply(reply)
-    (found,) = [event for byte in sent for event in receiver.feed(bytes((byte,)), 0.0)]
-    assert isinstance(found, Reply)
+    (fault,) = [event for byte in sent for event in receiver.feed(bytes((byte,)), 0.0)]
+    assert isinstance(fault, Reply)
     if reply.kind is ReplyKind.NACK and "status" not in STACKS[name].replies.header.roles:
-        assert found.kind is ReplyKind.NACK
+        assert fault.kind is ReplyKind.NACK
         return
     keys = ("kind", "id", "data", "code", "message_class", "sequence", "final", "uptime_ns", "time_ns")
-    assert {key: getattr(found, key) for key in keys} == {key: getattr(reply, key) for key in keys}
+    assert {key: getattr(fault, key) for key in keys} == {key: getattr(reply, key) for key in keys}
 
 
 def test_host_verifies_the_echo_before_the_reply() -> None:

@@ -129,7 +129,7 @@ def test_an_endless_message_keeps_within_bounds_and_counts_once() -> None:
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.lists(requests, max_size=6), st.lists(st.integers(1, 40), min_size=1), st.booleans())
 def test_requests_are_decoded_from_a_stream_cut_anywhere(
-    asked: list[Request], cuts: list[int], doubled: bool
+    originals: list[Request], cuts: list[int], doubled: bool
 ) -> None:
     def unambiguous(request: Request) -> bool:
         # a single 0x1F as id, followed by 1F, 7F or FF, means something else
@@ -137,7 +137,7 @@ def test_requests_are_decoded_from_a_stream_cut_anywhere(
 
     stream = b"".join(
         line if doubled or not unambiguous(request) else with_single_id(line)
-        for request in asked
+        for request in originals
         for line in [CUBESPACE.encode_request(request)]
     )
     receiver = CUBESPACE.device()
@@ -147,7 +147,7 @@ def test_requests_are_decoded_from_a_stream_cut_anywhere(
         size = cuts[number % len(cuts)]
         events += receiver.feed(stream[position : position + size], 0.0)
         position, number = position + size, number + 1
-    assert events == asked
+    assert events == originals
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)

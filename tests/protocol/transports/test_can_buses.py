@@ -328,11 +328,11 @@ def test_datagrams_that_are_no_frames_do_not_interrupt_a_bus_of_udp() -> None:
         errors: list[ProtocolError] = []
         await one.start(got.append, errors.append)
         await two.start(lambda _frame: None, errors.append)
-        known = pack_message(can.Message(arbitration_id=5))
+        datagram = pack_message(can.Message(arbitration_id=5))
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
             stranger.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
             for number in range(200):
-                junk = (b"", b"\xff" * 9, b"\x91" * 5000, known[:-3], known + b"\0")[number % 5]
+                junk = (b"", b"\xff" * 9, b"\x91" * 5000, datagram[:-3], datagram + b"\0")[number % 5]
                 stranger.sendto(junk, (group, 43113))
                 assert two.send(CanFrame(number))
                 await asyncio.sleep(0.001)

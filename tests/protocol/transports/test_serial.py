@@ -491,15 +491,15 @@ def test_the_bit_rate_changes_only_once_the_kernel_has_sent_its_buffer(
 ) -> None:
     async def main() -> None:
         async with serial_pair("pty and tty", tmp_path, baud=19200) as pair:
-            waiting, seen = [3, 2, 0], []
+            waiting, states = [3, 2, 0], []
             monkeypatch.setattr(
                 type(pair.two._port),  # type: ignore[attr-defined]
                 "out_waiting",
-                property(lambda port: (seen.append(port.baudrate), waiting.pop(0))[1]),
+                property(lambda port: (states.append(port.baudrate), waiting.pop(0))[1]),
             )
             pair.two.set_baud(38400)
             await until(lambda: not waiting)
-            assert (seen, pair.two._port.baudrate) == ([19200] * 3, 38400)  # type: ignore[attr-defined]
+            assert (states, pair.two._port.baudrate) == ([19200] * 3, 38400)  # type: ignore[attr-defined]
 
     asyncio.run(main())
 

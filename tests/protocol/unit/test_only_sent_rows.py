@@ -26,14 +26,14 @@ SUBSCRIBING = (
 def errors(folder: Path, text: str) -> list[str]:
     """Return the errors of `unit check`, which must be those of a start, without the name of the file."""
     unit = written(folder, text)
-    found = examine(unit)[1]
+    problems = examine(unit)[1]
     started: list[str] = []
     try:
         _unit_of(Profile.model_validate({"unit": str(unit), "links": {"can": {"channel": "off"}}}))
     except OneLineError as error:
         started = list(error.problems)
-    assert started == found
-    return [line.removeprefix(f"{unit}/unit.toml: ") for line in found]
+    assert started == problems
+    return [line.removeprefix(f"{unit}/unit.toml: ") for line in problems]
 
 
 @pytest.mark.parametrize("text", [packets("u8"), packets("u16"), STREAM], ids=["u8", "u16", "stream"])
@@ -65,24 +65,24 @@ def test_a_row_that_may_be_requested_but_cannot_is_named_with_field_and_remedy(t
 
 
 def test_an_acknowledge_without_data_is_named_with_its_remedy(tmp_path: Path) -> None:
-    (found,) = errors(tmp_path / "unit", packets().replace('answer = ["row', 'answer = ["reply", "row'))
-    assert found.startswith(
+    (problem,) = errors(tmp_path / "unit", packets().replace('answer = ["row', 'answer = ["reply", "row'))
+    assert problem.startswith(
         "telecommand set_time: link.serial: answer: link.serial.reply_header: length -1 does not fit"
     )
-    assert found.endswith("correct that field, or set `answer = []` if it is not answered")
+    assert problem.endswith("correct that field, or set `answer = []` if it is not answered")
 
 
 def test_all_rows_that_do_not_fit_are_listed_at_once(tmp_path: Path) -> None:
     long = '[[telemetry]]\nid = {0}\nname = "long_{0}"\ndoc = "d"\nfields = [{{ name = "a", type = "bytes", size = {1}, default = "" }}]\n'
     head, _, link = STREAM.partition("[link.serial]")
     rows = "".join(long.format(number, size) for number, size in ((20, 256), (21, 255), (22, 300)))
-    found = errors(
+    problems = errors(
         tmp_path / "unit",
         head + rows.replace(', default = ""', ', value = "image.chunk"') + "[link.serial]" + link,
     )
-    assert [line.partition(":")[0] for line in found] == ["telemetry long_20", "telemetry long_22"]
+    assert [line.partition(":")[0] for line in problems] == ["telemetry long_20", "telemetry long_22"]
     assert all(
-        f"length {size} does not fit 8 bits" in line for line, size in zip(found, (256, 300), strict=True)
+        f"length {size} does not fit 8 bits" in line for line, size in zip(problems, (256, 300), strict=True)
     )
 
 

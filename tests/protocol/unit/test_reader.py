@@ -314,14 +314,14 @@ def test_a_row_names_the_fields_that_it_would_clip() -> None:
 
 
 @pytest.mark.parametrize(
-    ("field", "said"),
+    ("field", "message"),
     [
         ('type = "i16", wrap = true', "only unsigned integers wrap"),
         ('type = "f32", wrap = true', "only unsigned integers wrap"),
         ('type = "u16", max = 7, wrap = true', "a field that wraps has no min and max"),
     ],
 )
-def test_wrapping_is_for_unsigned_counters(tmp_path: Path, field: str, said: str) -> None:
+def test_wrapping_is_for_unsigned_counters(tmp_path: Path, field: str, message: str) -> None:
     text = """[unit]
 name = "x"
 version = "1"
@@ -337,7 +337,7 @@ fields = [{ name = "n", FIELD }]
 """
     size = "4" if "f32" in field else "2"
     (tmp_path / "a.toml").write_text(text.replace("FIELD", field).replace("SIZE", size))
-    with pytest.raises(IcdError, match=said):
+    with pytest.raises(IcdError, match=message):
         load_unit(tmp_path)
 
 

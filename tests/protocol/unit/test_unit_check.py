@@ -129,11 +129,11 @@ FAILING = {
 
 @pytest.mark.parametrize(("source", "message"), FAILING.values(), ids=FAILING)
 def test_a_plugin_that_fails_is_one_line_and_status_1(tmp_path: Path, source: str, message: str) -> None:
-    code, said = unit_check(written(tmp_path, source.replace("encode(body[:-1]):", "encode(self, body):")))
+    code, output = unit_check(written(tmp_path, source.replace("encode(body[:-1]):", "encode(self, body):")))
     assert code == 1
-    assert message in said
-    assert "Traceback" not in said
-    assert sum(message in line for line in said.splitlines()) == 1
+    assert message in output
+    assert "Traceback" not in output
+    assert sum(message in line for line in output.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
@@ -223,15 +223,15 @@ def test_a_pipe_or_a_folder_as_plugin_is_rejected_at_once(tmp_path: Path) -> Non
 
 def test_without_the_plugin_nothing_of_it_runs_and_the_rest_is_checked(tmp_path: Path) -> None:
     folder = written(tmp_path, "raise AssertionError('ran')\n")
-    code, said = unit_check(folder, "--no-plugin")
-    assert code == 0, said
-    assert "unit.py was not run: its names, and examples on its link, are not checked" in said
+    code, output = unit_check(folder, "--no-plugin")
+    assert code == 0, output
+    assert "unit.py was not run: its names, and examples on its link, are not checked" in output
     (folder / "more.toml").write_text(
         ROW.replace("row", "other").replace("1", "3") + 'fields = ["u9 a"]\n', encoding="utf-8"
     )
-    code, said = unit_check(folder, "--no-plugin")
+    code, output = unit_check(folder, "--no-plugin")
     assert code == 1
-    assert "telemetry other: field 'u9 a': type" in said
+    assert "telemetry other: field 'u9 a': type" in output
 
 
 # -- all errors at once ------------------------------------------------------------------------------------------------
@@ -337,17 +337,17 @@ SAID = [
 def test_all_errors_of_all_stages_are_listed_at_once(tmp_path: Path) -> None:
     for name, text in MANY.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
-    found = examine(tmp_path)[1]
-    assert [said for said in SAID if not any(said in text for text in found)] == []
-    assert len(set(found)) == len(found)
-    assert not any("\n" in text for text in found)
+    problems = examine(tmp_path)[1]
+    assert [message for message in SAID if not any(message in text for text in problems)] == []
+    assert len(set(problems)) == len(problems)
+    assert not any("\n" in text for text in problems)
     # nothing is said only because something else is broken: `four` may be in the torn file, `two` and `broken` are wrong themselves
     assert [
         text
-        for text in found
+        for text in problems
         if "'four'" in text or "'two'" in text.partition("(given")[0] or "'broken'" in text or "three" in text
     ] == []
-    others = [text for text in found if not any(said in text for said in SAID)]
+    others = [text for text in problems if not any(message in text for message in SAID)]
     assert [text for text in others if "canopen" not in text] == []
 
 
@@ -431,8 +431,8 @@ def test_a_value_that_a_map_lacks_is_reported_as_the_one_that_stands_for_it(
     model = device_model()
     mode = model.enums["mode"]
     numbers = {**mode.values, "survey": 5}
-    known = mode.model_copy(update={"values": numbers, "instead": {"survey": "standby"}})
-    newer = replace(model, enums={**model.enums, "mode": known})
+    original = mode.model_copy(update={"values": numbers, "instead": {"survey": "standby"}})
+    newer = replace(model, enums={**model.enums, "mode": original})
     monkeypatch.setattr("starhil.protocol.icd.definition.device_model", lambda: newer)
     members = '"1" = ["boot", "standby"], "2" = "lost_in_space", "3" = "tracking", "9" = "error"'
     field = f'{{ name = "mode", type = "u8", value = "mode", map = {{ {members} }} }}'
@@ -441,6 +441,6 @@ def test_a_value_that_a_map_lacks_is_reported_as_the_one_that_stands_for_it(
     )
     row = load_unit(tmp_path).telemetry["row"]
     assert row.named_fields["mode"].aliases == {"standby": "boot", "survey": "boot"}
-    known.instead.clear()
+    original.instead.clear()
     with pytest.raises(IcdError, match="no number for survey"):
         load_unit(tmp_path)

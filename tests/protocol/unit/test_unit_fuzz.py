@@ -87,18 +87,18 @@ def decode(icd: InterfaceDefinition, event: Request | Reply | LinkFault) -> bool
 def test_bytes_of_another_unit_are_flagged_and_survived(unit, other):
     stack, foreign = SerialStack(load_unit(unit)), SerialStack(load_unit(other))
     receiver = stack.device()
-    found: list[FaultKind] = []
+    kinds: list[FaultKind] = []
     for number, sent in enumerate(exchanges(load_unit(other), foreign)[0]):
         events = [*receiver.feed(sent, number), *receiver.flush(number + 0.9)]
         faults = [event for event in events if isinstance(event, LinkFault)]
-        known = [
+        expected = [
             event
             for event in events
             if isinstance(event, Request) and stack.icd.row(event.id, event.message_class)
         ]
-        assert not known, (sent.hex(), events)  # any line may be the text of a request, but of no row
+        assert not expected, (sent.hex(), events)  # any line may be the text of a request, but of no row
         assert faults == events or stack.text_formats, (sent.hex(), events)
-        found += [event.kind for event in faults]
-    assert found
+        kinds += [event.kind for event in faults]
+    assert kinds
     own = exchanges(load_unit(unit), stack)[0][0]
     assert isinstance(receiver.feed(own, 1e6)[-1], Request)

@@ -207,12 +207,12 @@ def test_all_errors_are_listed(tmp_path):
         HEAD + telemetry(wrong, "one") + telecommand("", "reboot"), encoding="utf-8"
     )
     (tmp_path / "b.toml").write_text(telemetry(wrong, "two", 2), encoding="utf-8")
-    found = examine(tmp_path)[1]
-    assert len(found) == 3
-    assert [text for text in found if "b.toml: telemetry two: field a" in text]
+    problems = examine(tmp_path)[1]
+    assert len(problems) == 3
+    assert [text for text in problems if "b.toml: telemetry two: field a" in text]
     with pytest.raises(IcdError) as caught:
         load_unit(tmp_path)
-    assert list(caught.value.args) == found
+    assert list(caught.value.args) == problems
 
 
 def test_unbound_rows_cannot_be_emulated(unit, tmp_path):

@@ -105,11 +105,11 @@ def test_an_error_of_the_camera_turns_the_attitude_by_what_its_covariance_says(
         return ((xy - frame.xy_px) / sigma[:, None]).ravel()
 
     turn = least_squares(residuals, np.zeros(3), x_scale=1e-6, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
-    known = np.zeros((9, 9))
-    known[number, number] = error**2
+    camera_covariance = np.zeros((9, 9))
+    camera_covariance[number, number] = error**2
     exact = np.zeros_like(frame.xy_px)
-    with_error, _ = attitude_covariance(camera, known, frame.xy_px, sigma, exact, 1e12)
-    noise, _ = attitude_covariance(camera, 0.0 * known, frame.xy_px, sigma, exact, 1e12)
+    with_error, _ = attitude_covariance(camera, camera_covariance, frame.xy_px, sigma, exact, 1e12)
+    noise, _ = attitude_covariance(camera, 0.0 * camera_covariance, frame.xy_px, sigma, exact, 1e12)
     np.testing.assert_allclose(
         with_error - noise, np.outer(turn, turn), atol=2e-3 * np.abs(turn).max() ** 2 + 1e-12 * noise.max()
     )
@@ -120,8 +120,8 @@ def test_what_errors_of_the_camera_explain_is_not_noise(sky: StarCatalog) -> Non
     (frame,), (truth,) = simulated(sky, WIDE, 1, 7, sigma=0.0)
     rng = np.random.default_rng(8)
     sigma = rng.uniform(0.05, 0.3, len(frame.xy_px))
-    known = np.array([0.67, 0.67, 0.04, 0.04, 3e-4, 4e-4, 1e-5, 1e-5, 1e-6])
-    wrong = values(WIDE) + known * rng.standard_normal(9)
+    sigmas = np.array([0.67, 0.67, 0.04, 0.04, 3e-4, 4e-4, 1e-5, 1e-5, 1e-6])
+    wrong = values(WIDE) + sigmas * rng.standard_normal(9)
     measured = frame.xy_px + sigma[:, None] * rng.standard_normal(frame.xy_px.shape)
 
     def shown(p: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -131,13 +131,13 @@ def test_what_errors_of_the_camera_explain_is_not_noise(sky: StarCatalog) -> Non
     options = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15}
     alone = least_squares(lambda turn: shown(wrong, turn).ravel(), np.zeros(3), x_scale=1e-6, **options)
     both = least_squares(
-        lambda x: np.append(shown(wrong + known * x[3:], x[:3]).ravel(), x[3:]), np.zeros(12),
+        lambda x: np.append(shown(wrong + sigmas * x[3:], x[:3]).ravel(), x[3:]), np.zeros(12),
         x_scale=np.append(np.full(3, 1e-6), np.ones(9)), **options,
     )  # fmt: skip
     freedom = 2 * len(measured) - 3
     camera = Camera(937, 937, (wrong[0], wrong[1]), (wrong[2], wrong[3]), "pinhole", tuple(wrong[4:]))
     offset = -shown(wrong, alone.x) * sigma[:, None]
-    _, noise_px = attitude_covariance(camera, np.diag(known**2), measured, sigma, offset, 0.0)
+    _, noise_px = attitude_covariance(camera, np.diag(sigmas**2), measured, sigma, offset, 0.0)
     expected = math.sqrt(2.0 * both.cost / freedom * np.mean(sigma**2))
     assert noise_px == pytest.approx(expected, rel=1e-3)
     assert alone.cost > 1.5 * both.cost, "the error of the camera must matter"

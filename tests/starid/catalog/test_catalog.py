@@ -228,14 +228,14 @@ def test_merging_adds_flux_and_weights_positions(sky: StarCatalog) -> None:
 def test_companions_are_the_faint_stars_near_bright_ones(
     sky: StarCatalog, limit: float, arcseconds: float
 ) -> None:
-    found = companions(sky, limit, arcseconds * ARCSECOND)
+    pairs = companions(sky, limit, arcseconds * ARCSECOND)
     faint = np.flatnonzero(sky.v > limit)
     bright = sky.vectors[sky.v <= limit]
     expected = faint[:0]
     if len(bright) and len(faint):
         gap, _ = cKDTree(bright).query(sky.vectors[faint])
         expected = faint[gap <= 2.0 * math.sin(0.5 * arcseconds * ARCSECOND)]
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(pairs, expected)
 
 
 @given(distance=st.floats(0.0, 3.0), ratio=st.floats(0.0, 1.0))

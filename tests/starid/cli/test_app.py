@@ -98,13 +98,13 @@ def test_a_profile_that_the_emulator_does_not_have_ends_with_one_line(
 ) -> None:
     ((name, value),) = PROJECT["project"]["entry-points"]["starid.cameras"].items()
     monkeypatch.setattr(identify, "entry_points", lambda group: [EntryPoint(name, value, group)])
-    status, out, said = run_command_line(
+    status, out, stderr = run_command_line(
         "identify", str(photograph), "--profile", "cubestarr", program="starid"
     )
     assert (status, out) == (2, "")
-    assert said.startswith("starid: profile 'cubestarr': not found; ")
-    assert said.endswith("did you mean cubestar, cubestar-2013?\n")
-    assert said.count("\n") == 1
+    assert stderr.startswith("starid: profile 'cubestarr': not found; ")
+    assert stderr.endswith("did you mean cubestar, cubestar-2013?\n")
+    assert stderr.count("\n") == 1
 
 
 def test_an_annotated_photograph_is_named_in_the_output(photograph: Path, tmp_path: Path) -> None:
@@ -131,13 +131,13 @@ def test_the_laboratory_rejects_what_it_cannot_do_before_the_work(
 ) -> None:
     file = tmp_path / "notes.txt"
     file.touch()
-    status, out, said = run_command_line(
+    status, out, stderr = run_command_line(
         *(word.replace("FILE", str(file)) for word in words), program="starid"
     )
     assert (status, out) == (2, "")
-    assert said.startswith("starid: ")
-    assert why.replace("FILE", str(file)) in said
-    assert said.count("\n") == 1
+    assert stderr.startswith("starid: ")
+    assert why.replace("FILE", str(file)) in stderr
+    assert stderr.count("\n") == 1
 
 
 def test_an_extra_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

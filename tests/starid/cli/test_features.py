@@ -53,7 +53,7 @@ def test_build_and_info(tmp_path):
 
 
 def test_spherical_features_say_their_unit_and_have_the_defaults_of_a_database():
-    given = call(
+    result = call(
         *[
             "features",
             "--ra",
@@ -70,8 +70,8 @@ def test_spherical_features_say_their_unit_and_have_the_defaults_of_a_database()
             "v",
         ]
     )
-    assert "px" in given.stdout
-    assert given.stdout == call(*["features", "--ra", "10", "--dec", "20", "--geometry", "spherical"]).stdout
+    assert "px" in result.stdout
+    assert result.stdout == call(*["features", "--ra", "10", "--dec", "20", "--geometry", "spherical"]).stdout
 
 
 @pytest.mark.parametrize(

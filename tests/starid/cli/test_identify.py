@@ -45,15 +45,15 @@ def test_identify_finds_the_attitude_of_a_rendered_image(tmp_path, ra, dec, roll
     image = tmp_path / "sky.png"
     options = ["--ra", str(ra), "--dec", str(dec), "--roll", str(roll), "--seed", "1"]
     assert starhil("render", *options, "-o", str(image)).exit_code == 0
-    found = answer(image)
-    error = Attitude.from_quaternion(found["quaternion_xyzw"]).error_to(
+    fields = answer(image)
+    error = Attitude.from_quaternion(fields["quaternion_xyzw"]).error_to(
         Attitude.from_radec_roll(ra, dec, roll)
     )
-    assert found["valid"]
-    assert found["reason"] == "ok"
+    assert fields["valid"]
+    assert fields["reason"] == "ok"
     assert error.total_arcsec < 3600 * DEGREE_LIMIT
-    again = Attitude.from_radec_roll(found["ra_deg"], found["dec_deg"], found["roll_deg"])
-    assert again.error_to(Attitude.from_quaternion(found["quaternion_xyzw"])).total_arcsec < 1e-6
+    again = Attitude.from_radec_roll(fields["ra_deg"], fields["dec_deg"], fields["roll_deg"])
+    assert again.error_to(Attitude.from_quaternion(fields["quaternion_xyzw"])).total_arcsec < 1e-6
 
 
 def test_an_unknown_camera_is_measured_from_its_image(tmp_path):
@@ -111,11 +111,11 @@ def test_noise_alone_gives_no_attitude(tmp_path):
     image = tmp_path / "noise.png"
     cv2.imwrite(str(image), np.random.default_rng(1).normal(60, 4, (937, 937)).astype(np.uint8))
     result = starid("identify", str(image), "--json")
-    found = json.loads(result.stdout)
+    fields = json.loads(result.stdout)
     assert result.exit_code == 1
-    assert not found["valid"]
-    assert found["reason"] == "too_few_stars"
-    assert found["ra_deg"] is None
+    assert not fields["valid"]
+    assert fields["reason"] == "too_few_stars"
+    assert fields["ra_deg"] is None
 
 
 def test_a_hopeless_image_is_given_up_in_time_and_progress_is_shown(tmp_path, monkeypatch):
@@ -209,7 +209,7 @@ def test_the_aberration_of_a_dated_image_is_corrected(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (["--date", "yesterday"], "--date: must be a date from 1970 to 2100"),
         (["--observer-velocity", "1,2"], "three numbers in m/s as X,Y,Z"),
@@ -217,12 +217,12 @@ def test_the_aberration_of_a_dated_image_is_corrected(tmp_path):
         (["--observer-velocity", "0,0,3e8"], "at most 1e+06"),
     ],
 )
-def test_a_bad_date_or_velocity_is_rejected(tmp_path, options, said):
+def test_a_bad_date_or_velocity_is_rejected(tmp_path, options, message):
     image = tmp_path / "dark.png"
     cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 25, (937, 937)).astype(np.uint8))
     result = starid("identify", str(image), *options)
     assert result.exit_code != 0
-    assert said in str(result.exception)
+    assert message in str(result.exception)
 
 
 def test_with_a_dark_frame_the_stars_of_a_hot_sensor_are_found_and_no_more(tmp_path):
@@ -237,11 +237,11 @@ def test_with_a_dark_frame_the_stars_of_a_hot_sensor_are_found_and_no_more(tmp_p
     cv2.imwrite(str(hot), np.clip(pixels + np.rint(signal), 0, 255).astype(np.uint8))
     cv2.imwrite(str(dark), np.rint(8.0 + signal).astype(np.uint8))
     without = json.loads(starid("identify", str(hot), "--json").stdout)
-    found = answer(hot, "--dark", str(dark))
+    fields = answer(hot, "--dark", str(dark))
     plain = answer(sky)
     assert without["stars_detected"] > 1.4 * plain["stars_detected"]
-    assert abs(found["stars_detected"] - plain["stars_detected"]) < 0.2 * plain["stars_detected"]
-    assert found["ra_deg"] == pytest.approx(plain["ra_deg"], abs=1e-3)
+    assert abs(fields["stars_detected"] - plain["stars_detected"]) < 0.2 * plain["stars_detected"]
+    assert fields["ra_deg"] == pytest.approx(plain["ra_deg"], abs=1e-3)
 
 
 def test_the_centre_of_the_image_is_named_where_the_optical_axis_misses_it(tmp_path):

@@ -15,6 +15,8 @@ from starid.identification.predicted_stars import expected_places, noise_peaks, 
 from starid.identification.solution import Solution
 from starid.imaging.detection import Detections
 
+pytestmark = pytest.mark.long
+
 SIGMA_RAD = 60.0 / 206265.0
 PRIOR = np.diag([SIGMA_RAD**2, SIGMA_RAD**2, 4.0 * SIGMA_RAD**2])
 ZERO_POINT, SNR, POSITION_PX = 14.0, 8.0, 0.15

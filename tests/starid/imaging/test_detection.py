@@ -57,11 +57,11 @@ def scattered(count: int, shape: tuple[int, int], seed: int, gap: float = 14.0) 
     return np.array(places)
 
 
-def matched(found: Detections, places: np.ndarray, reach: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
+def matched(detections: Detections, places: np.ndarray, reach: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
     """For each position the index of its detection (−1 if none); a mask of spurious detections."""
-    gaps = np.linalg.norm(places[:, None] - found.xy_px[None], axis=2)
+    gaps = np.linalg.norm(places[:, None] - detections.xy_px[None], axis=2)
     nearest = np.where(gaps.min(axis=1) < reach, gaps.argmin(axis=1), -1)
-    return nearest, np.setdiff1d(np.arange(len(found)), nearest)
+    return nearest, np.setdiff1d(np.arange(len(detections)), nearest)
 
 
 @pytest.mark.parametrize("top", [255, 65535])
@@ -72,16 +72,16 @@ def test_stars_are_found_where_they_are(top: int) -> None:
     image = photograph(
         sum(spot(shape, *place, flux) for place, flux in zip(places, fluxes, strict=True)), top=top
     )
-    found = detect(image, KNOWN)
-    number, spurious = matched(found, places)
+    detections = detect(image, KNOWN)
+    number, spurious = matched(detections, places)
     assert np.all(number >= 0)
     assert len(spurious) == 0
-    assert found.reason == ""
-    assert found.background == pytest.approx(SKY, abs=0.5)
-    assert found.noise == pytest.approx(NOISE, rel=0.05)
-    assert found.psf_sigma_px == pytest.approx(SIGMA, rel=0.05)
-    assert np.all(np.diff(found.flux) <= 0.0), "brightest first"
-    pull = (found.flux[number] / GAIN - fluxes) / (found.flux_sigma[number] / GAIN)
+    assert detections.reason == ""
+    assert detections.background == pytest.approx(SKY, abs=0.5)
+    assert detections.noise == pytest.approx(NOISE, rel=0.05)
+    assert detections.psf_sigma_px == pytest.approx(SIGMA, rel=0.05)
+    assert np.all(np.diff(detections.flux) <= 0.0), "brightest first"
+    pull = (detections.flux[number] / GAIN - fluxes) / (detections.flux_sigma[number] / GAIN)
     assert abs(pull.mean()) < 0.7
     assert pull.std() == pytest.approx(1.0, abs=0.4)
 
@@ -94,12 +94,12 @@ def test_errors_are_calibrated_and_reach_the_bound(flux: float) -> None:
     for seed in range(4):
         places = scattered(120, shape, seed, gap=16.0)
         image = photograph(sum(spot(shape, *place, flux) for place in places), seed)
-        found = detect(image, DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA, model_error=0.0))
-        number, _ = matched(found, places)
+        detections = detect(image, DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA, model_error=0.0))
+        number, _ = matched(detections, places)
         assert np.all(number >= 0)
-        error = found.xy_px[number] - places
-        squares.append((error / found.xy_sigma_px[number]) ** 2)
-        stated.append(found.xy_sigma_px[number])
+        error = detections.xy_px[number] - places
+        squares.append((error / detections.xy_sigma_px[number]) ** 2)
+        stated.append(detections.xy_sigma_px[number])
     normalised = np.concatenate(squares)
     assert normalised.mean() == pytest.approx(1.0, abs=0.2)
     model = spot((31, 31), 15.0, 15.0, flux)
@@ -136,26 +136,26 @@ def test_saturated_stars_are_flagged_and_still_centred() -> None:
     places = scattered(15, shape, 4, gap=30.0)
     light = sum(spot(shape, *place, 20000.0) for place in places)
     image = photograph(light, top=255)
-    found = detect(image, DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA))
-    number, spurious = matched(found, places, 0.5)
+    detections = detect(image, DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA))
+    number, spurious = matched(detections, places, 0.5)
     assert np.all(number >= 0)
     assert len(spurious) == 0
-    assert np.all(found.saturated[number])
-    error = found.xy_px[number] - places
+    assert np.all(detections.saturated[number])
+    error = detections.xy_px[number] - places
     assert np.sqrt(np.mean(error**2)) < 0.03
-    assert np.median(found.flux[number]) == pytest.approx(20000.0 * GAIN, rel=0.2)
+    assert np.median(detections.flux[number]) == pytest.approx(20000.0 * GAIN, rel=0.2)
 
 
 def test_stars_at_the_edge_are_flagged() -> None:
     shape = (120, 160)
     places = np.array([(0.4, 60.0), (159.2, 30.0), (80.0, 0.2), (40.0, 118.7), (80.0, 60.0), (30.0, 40.0)])
-    found = detect(photograph(sum(spot(shape, *place, 2000.0) for place in places)), KNOWN)
-    number, _ = matched(found, places)
+    detections = detect(photograph(sum(spot(shape, *place, 2000.0) for place in places)), KNOWN)
+    number, _ = matched(detections, places)
     assert np.all(number >= 0)
-    assert found.edge[number].tolist() == [True, True, True, True, False, False]
-    error = np.hypot(*(found.xy_px[number] - places).T)
+    assert detections.edge[number].tolist() == [True, True, True, True, False, False]
+    error = np.hypot(*(detections.xy_px[number] - places).T)
     assert np.all(error < 0.25)
-    assert np.all(found.xy_sigma_px[number[:4]].max(axis=1) > found.xy_sigma_px[number[4:]].max())
+    assert np.all(detections.xy_sigma_px[number[:4]].max(axis=1) > detections.xy_sigma_px[number[4:]].max())
 
 
 @pytest.mark.parametrize("height", [60.0, 300.0, 3000.0, 60000.0])
@@ -164,11 +164,11 @@ def test_hot_pixels_are_rejected(height: float) -> None:
     places = scattered(30, shape, 6)
     light = sum(spot(shape, *place, 1500.0) for place in places[:15])
     light[tuple(np.rint(places[15:]).astype(int)[:, ::-1].T)] += height
-    found = detect(photograph(light), KNOWN)
-    number, spurious = matched(found, places[:15])
+    detections = detect(photograph(light), KNOWN)
+    number, spurious = matched(detections, places[:15])
     assert np.all(number >= 0)
     assert len(spurious) == 0
-    assert found.rejected >= 15
+    assert detections.rejected >= 15
 
 
 def test_saturated_hot_pixels_are_rejected() -> None:
@@ -245,12 +245,12 @@ def test_trails_of_a_rotating_sensor_are_followed(dx: float, dy: float) -> None:
     places = places[np.all((places > 20.0) & (places < np.array([479.0, 379.0])), axis=1)]
     fluxes = np.geomspace(3000.0, 30000.0, len(places))
     light = sum(trail(shape, *place, flux, dx, dy) for place, flux in zip(places, fluxes, strict=True))
-    found = detect(photograph(light), KNOWN)
-    number, spurious = matched(found, places)
+    detections = detect(photograph(light), KNOWN)
+    number, spurious = matched(detections, places)
     assert np.all(number >= 0)
     assert len(spurious) <= 1
-    assert found.trail_px == pytest.approx(math.hypot(dx, dy), rel=0.05)
-    error = (found.xy_px[number] - places) / found.xy_sigma_px[number]
+    assert detections.trail_px == pytest.approx(math.hypot(dx, dy), rel=0.05)
+    error = (detections.xy_px[number] - places) / detections.xy_sigma_px[number]
     assert np.mean(error**2) == pytest.approx(1.0, abs=0.5)
 
 
@@ -262,13 +262,13 @@ def test_trails_are_followed_among_more_and_brighter_round_points() -> None:
     stars, points = places[::3], np.concatenate([places[1::3], places[2::3]])
     light = sum(trail(shape, *place, 3000.0, 6.0, -2.0) for place in stars)
     light = light + sum(spot(shape, *place, 9000.0) for place in points)
-    found = detect(photograph(light), KNOWN)
+    detections = detect(photograph(light), KNOWN)
     assert len(points) > 1.8 * len(stars) > 18
-    assert found.trail_px == pytest.approx(math.hypot(6.0, 2.0), rel=0.1)
-    number, spurious = matched(found, stars)
+    assert detections.trail_px == pytest.approx(math.hypot(6.0, 2.0), rel=0.1)
+    number, spurious = matched(detections, stars)
     assert np.all(number >= 0)
     assert len(spurious) == 0  # an object at rest while the stars move is not a star
-    error = (found.xy_px[number] - stars) / found.xy_sigma_px[number]
+    error = (detections.xy_px[number] - stars) / detections.xy_sigma_px[number]
     assert np.mean(error**2) == pytest.approx(1.0, abs=0.6)
 
 
@@ -359,11 +359,11 @@ def test_trails_of_a_roll_are_followed() -> None:
     off = places - 199.5
     trails = roll * np.column_stack([-off[:, 1], off[:, 0]])
     light = sum(trail(shape, *place, 15000.0, *path) for place, path in zip(places, trails, strict=True))
-    found = detect(photograph(light), KNOWN)
-    number, _ = matched(found, places, 1.0)
+    detections = detect(photograph(light), KNOWN)
+    number, _ = matched(detections, places, 1.0)
     assert np.mean(number >= 0) > 0.95
     number, places = number[number >= 0], places[number >= 0]
-    assert np.sqrt(np.mean((found.xy_px[number] - places) ** 2)) < 0.05
+    assert np.sqrt(np.mean((detections.xy_px[number] - places) ** 2)) < 0.05
 
 
 def test_round_stars_have_no_trail() -> None:
@@ -382,12 +382,12 @@ def test_uneven_sky_does_not_move_stars() -> None:
     sky = 3000.0 * (1.0 - 0.5 * radius2) + 1.5 * columns
     places = scattered(80, shape, 12)
     light = sum(spot(shape, *place, 900.0) for place in places)
-    found = detect(photograph(light, sky=sky), DetectionSettings())
-    number, spurious = matched(found, places)
+    detections = detect(photograph(light, sky=sky), DetectionSettings())
+    number, spurious = matched(detections, places)
     assert np.mean(number >= 0) > 0.97
     assert len(spurious) == 0
     seen = number >= 0
-    error = found.xy_px[number[seen]] - places[seen]
+    error = detections.xy_px[number[seen]] - places[seen]
     assert np.all(np.abs(error.mean(axis=0)) < 0.02)
 
 
@@ -408,11 +408,11 @@ def test_other_spot_widths_are_estimated(sigma: float) -> None:
     shape = (400, 400)
     places = scattered(60, shape, 14, gap=22.0)
     light = sum(spot(shape, *place, 6000.0, sigma) for place in places)
-    found = detect(photograph(light), KNOWN)
-    number, spurious = matched(found, places)
+    detections = detect(photograph(light), KNOWN)
+    number, spurious = matched(detections, places)
     assert np.all(number >= 0)
     assert len(spurious) == 0
-    assert found.psf_sigma_px == pytest.approx(sigma, rel=0.12)
+    assert detections.psf_sigma_px == pytest.approx(sigma, rel=0.12)
 
 
 def test_star_sizes_can_be_limited() -> None:
@@ -443,11 +443,11 @@ def test_at_most_max_stars() -> None:
 def test_black_white_and_flat_images_have_a_reason(dtype: type, shape: tuple[int, int]) -> None:
     top = int(np.iinfo(dtype).max)
     for level, word in ((0, "flat"), (7, "flat"), (top, "saturated")):
-        found = detect(np.full(shape, level, dtype=dtype))
-        assert len(found) == 0
-        assert word in found.reason
-        assert found.xy_px.shape == (0, 2)
-        assert found.sigma_px.shape == (0,)
+        detections = detect(np.full(shape, level, dtype=dtype))
+        assert len(detections) == 0
+        assert word in detections.reason
+        assert detections.xy_px.shape == (0, 2)
+        assert detections.sigma_px.shape == (0,)
 
 
 @pytest.mark.parametrize(
@@ -515,14 +515,14 @@ def test_the_image_is_not_changed() -> None:
     )
 )
 def test_any_image_gets_an_answer(image: np.ndarray) -> None:
-    found = detect(image)
-    assert np.all(np.isfinite(found.xy_px))
-    assert np.all(np.isfinite(found.flux))
-    assert np.all(found.xy_sigma_px > 0.0)
-    assert np.all(found.flux > 0.0)
-    inside = (found.xy_px > -0.5) & (found.xy_px < np.array(image.shape[::-1]) - 0.5)
+    detections = detect(image)
+    assert np.all(np.isfinite(detections.xy_px))
+    assert np.all(np.isfinite(detections.flux))
+    assert np.all(detections.xy_sigma_px > 0.0)
+    assert np.all(detections.flux > 0.0)
+    inside = (detections.xy_px > -0.5) & (detections.xy_px < np.array(image.shape[::-1]) - 0.5)
     assert np.all(inside)
-    assert bool(found.reason) == (len(found) == 0)
+    assert bool(detections.reason) == (len(detections) == 0)
 
 
 @settings(max_examples=40, deadline=None, derandomize=True)

@@ -245,11 +245,11 @@ def test_a_flow_is_found_in_every_direction(flow: tuple[float, ...]) -> None:
     places = flow_places(30)
     trails = flow_trails(truth, places, 0.05)
     trails[:3] = ((9.0, -9.0), (0.0, 12.0), (-20.0, 3.0))
-    found = np.zeros(5)
-    fit_flow(places, trails, found)
-    error = min(np.abs(found - truth).max(), np.abs(found + truth).max())
+    sums = np.zeros(5)
+    fit_flow(places, trails, sums)
+    error = min(np.abs(sums - truth).max(), np.abs(sums + truth).max())
     assert error < 0.15
-    length, off = (np.median(each) for each in lengths_and_mismatches(found, places, trails))
+    length, off = (np.median(each) for each in lengths_and_mismatches(sums, places, trails))
     assert off < 0.15
     assert length == pytest.approx(np.median(lengths_and_mismatches(truth, places, trails)[0]), rel=0.05)
 
@@ -290,11 +290,11 @@ def test_a_straight_trail_fitted_to_a_curved_one_is_shifted_as_stated(length: fl
         )
         return each @ weights
 
-    seen = light(path)
+    image = light(path)
     straight = np.array(trail_at(flow, *start, size, size))
 
     def misfit(p: np.ndarray) -> np.ndarray:
-        return (p[2] * light(p[:2] + order[:, None] * straight) - seen).ravel()
+        return (p[2] * light(p[:2] + order[:, None] * straight) - image).ravel()
 
     fitted = least_squares(misfit, np.array([*start, 1.0]), xtol=1e-14, ftol=1e-14, gtol=1e-14).x[:2]
     stated, trails = trail_shifts(flow, start[None], (size, size), sigma, float(np.hypot(*straight)))
@@ -375,7 +375,7 @@ def test_sums_along_trails_are_plain_sums() -> None:
 def test_spot_widths_have_no_bias(sigma: float) -> None:
     rng = np.random.default_rng(7)
     level, noise = np.full((2, 2), 50.0, np.float32), np.full((2, 2), 3.0, np.float32)
-    found = []
+    errors = []
     for _ in range(40):
         x, y = 30.0 + rng.uniform(-0.5, 0.5, 2)
         edges = np.arange(62) - 0.5
@@ -383,6 +383,6 @@ def test_spot_widths_have_no_bias(sigma: float) -> None:
         image = np.rint(50.0 + 8000.0 * np.outer(*shares) + rng.normal(0.0, 3.0, (61, 61))).astype(np.uint16)
         widths = np.empty(1)
         if spot_widths(image, np.array([[30, 30]], np.int32), level, noise, 32.0, 0.9, 65535.0, widths):
-            found.append(widths[0])
-    assert len(found) > 30
-    assert np.median(found) == pytest.approx(sigma, rel=0.02)
+            errors.append(widths[0])
+    assert len(errors) > 30
+    assert np.median(errors) == pytest.approx(sigma, rel=0.02)

@@ -58,7 +58,7 @@ def test_false_peaks_at_the_edge_of_a_dark_body_are_counted_apart() -> None:
     """Between two levels the background is neither: what is detected there says nothing about places on an even sky."""
     faint = DetectionSettings(psf_sigma_px=SIGMA, threshold_sigma=3.0, min_star_pixels=0)
     edge = np.column_stack([np.full(20, 200.0), np.linspace(30.0, 370.0, 20)])
-    at_edge = seen = 0
+    at_edge = inside = 0
     counted = []
     for seed in range(10):
         image = sky(np.zeros((0, 2)), 0.0, seed)
@@ -71,9 +71,9 @@ def test_false_peaks_at_the_edge_of_a_dark_body_are_counted_apart() -> None:
         for place, expected in zip(alone.xy_px, alone_rivals, strict=True):
             gap = np.hypot(*(both.xy_px - place).T)
             if gap.min() < 0.05:
-                seen += 1
+                inside += 1
                 assert rivals[gap.argmin()] == pytest.approx(expected, abs=3.5 * ONE)
-    assert seen > 5
+    assert inside > 5
     assert at_edge > 5
     assert np.mean(counted) > 7.0, "or they would not have mattered"
 

@@ -10,6 +10,8 @@ import pytest
 from starid.imaging.detection import DetectionSettings, detect
 from starid.imaging.unmodelled_light import shift_by_hidden_stars
 
+pytestmark = pytest.mark.long
+
 SIGMA_PX = 0.8
 WIDTH_PX = math.sqrt(SIGMA_PX**2 + 1.0 / 12.0)
 FLUX = 1000.0
@@ -92,15 +94,15 @@ def test_a_star_that_an_edge_cuts_has_the_error_of_the_step() -> None:
     over, cut = [], []
     for _ in range(60):
         x, y = 40.0 + rng.uniform(-0.5, 0.5, 2)
-        found = detect(
+        detections = detect(
             image_with_edge(rng, 40.0 - rng.uniform(0.0, 3.0), 12.0, x, y),
             DetectionSettings(psf_sigma_px=SIGMA_PX),
         )
-        off = found.xy_px - (x, y)
+        off = detections.xy_px - (x, y)
         near = np.flatnonzero(np.hypot(*off.T) < 3.0)
         if near.size:
-            over.append(np.abs(off[near[0]]).max() / found.sigma_px[near[0]])
-            cut.append(found.sigma_px[near[0]])
+            over.append(np.abs(off[near[0]]).max() / detections.sigma_px[near[0]])
+            cut.append(detections.sigma_px[near[0]])
     assert len(over) > 20
     assert max(over) < 4.0
     height = 8.0 * math.pi * SIGMA_PX**3 * 12.0 / (math.sqrt(2.0 * math.pi) * 200.0)

@@ -74,18 +74,19 @@ def write_package(folder: Path, *, slope: float = 2.0) -> Path:
     return folder
 
 
-def process(folder: Path) -> subprocess.Popen[str]:
+def process(folder: Path, umask: int = -1) -> subprocess.Popen[str]:
     """Start a process that calls the kernel; without bytecode, which is compared by the second of its source."""
     command = [sys.executable, "-B", "-c", RUN]
     environment = {**os.environ, "PYTHONPATH": str(folder)}
     return subprocess.Popen(
-        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+        command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        umask=umask,
+    )  # fmt: skip
 
 
-def run(folder: Path, warning: str = "") -> list[str]:
+def run(folder: Path, warning: str = "", umask: int = -1) -> list[str]:
     """Result of the kernel in a new process, and how often its machine code was loaded."""
-    out, errors = process(folder).communicate(timeout=PATIENCE_S)
+    out, errors = process(folder, umask).communicate(timeout=PATIENCE_S)
     assert (warning in errors) if warning else not errors, errors
     return out.split()
 
@@ -205,12 +206,12 @@ def test_what_a_process_replaces_while_another_one_records_is_kept(
         kernel_cache.record_checksums(folder)
 
     def checksum(file: Path) -> int:
-        found = read(file)
+        content = read(file)
         if not others:
             others.append(threading.Thread(target=replace))
             others[0].start()
             others[0].join(1.0)
-        return found
+        return content
 
     monkeypatch.setattr(kernel_cache, "_checksum", checksum)
     kernel_cache.record_checksums(folder)
@@ -268,6 +269,30 @@ def test_kernels_run_where_the_cache_cannot_be_written_and_a_line_says_so(
     assert run(tmp_path, warning) == ["2.5", "0"]
 
 
+def reached_by_others(cache_folder: Path) -> list[Path]:
+    """What others may enter or read, of the folder and what is in it."""
+    found = [cache_folder] if cache_folder.stat().st_mode & 0o055 else []
+    for folder in found:
+        found += [each for each in folder.iterdir() if each.stat().st_mode & 0o055] if folder.is_dir() else []
+    return found
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no umask there")
+def test_others_cannot_change_kernels_whatever_the_umask(tmp_path: Path, cache_folder: Path) -> None:
+    """In a folder made with mode 755, the kernels of a process with umask 0 could be replaced by anybody."""
+    cache_folder.mkdir()
+    cache_folder.chmod(0o755)
+    write_package(tmp_path)
+    assert run(tmp_path, umask=0o022) == ["2.5", "0"]
+    assert len(reached_by_others(cache_folder)) > 3  # as the cache in the image of a container
+    for path in machine_code(cache_folder):
+        path.unlink()
+    for loaded in "01":
+        assert run(tmp_path, umask=0) == ["2.5", loaded]
+    assert machine_code(cache_folder)
+    assert not [path for path in reached_by_others(cache_folder) if path.stat().st_mode & 0o022]
+
+
 def test_a_cache_that_can_only_be_read_is_used(
     tmp_path: Path, cache_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -281,6 +306,7 @@ def test_a_cache_that_can_only_be_read_is_used(
     copy = Path(os.environ["NUMBA_CACHE_DIR"])
     assert copy != folder
     assert (copy / "package" / "kernel.nbc").read_bytes() == b"code"
+    assert copy.stat().st_mode & 0o777 == 0o700
 
 
 def test_a_cache_that_can_be_neither_written_nor_copied_is_one_line(

@@ -56,11 +56,11 @@ def centre_error_arcsec(found: ImageSolution, truth, camera: Camera) -> float:
 )
 def test_attitude_field_and_distortion_of_a_photograph_are_found(sky, seed, defects) -> None:
     image, truth, camera = photograph(sky, seed, **defects)
-    found = solve_image(image, NOMINAL, sky, fov_tolerance=0.1)
-    assert found.solution.valid
-    assert not found.mirrored
-    assert centre_error_arcsec(found, truth, camera) < CENTRE_ARCSEC
-    assert found.camera.fov_deg == pytest.approx(camera.fov_deg, rel=2e-3)
+    solution = solve_image(image, NOMINAL, sky, fov_tolerance=0.1)
+    assert solution.solution.valid
+    assert not solution.mirrored
+    assert centre_error_arcsec(solution, truth, camera) < CENTRE_ARCSEC
+    assert solution.camera.fov_deg == pytest.approx(camera.fov_deg, rel=2e-3)
 
 
 WIDE = {"fov_deg": 34.0, "width": 808, "height": 608}

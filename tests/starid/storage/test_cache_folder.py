@@ -188,6 +188,24 @@ def test_kernels_in_a_folder_to_which_others_may_write_are_not_used(
     assert cache.kernel_folder(key) != folder
 
 
+@pytest.mark.parametrize("mode", [0o666, 0o777])
+def test_kernels_to_which_others_may_write_are_not_used_whatever_the_folder_above(
+    temporary: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: int
+) -> None:
+    """A process whose umask lets others write had made the folder of a module, or a kernel."""
+    key = "0123456789abcdef"
+    folder = tmp_path / "cache" / "kernels" / key
+    kernel = folder / "module" / "kernel.nbc"
+    kernel.parent.mkdir(parents=True)
+    kernel.write_bytes(b"code")
+    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path / "cache"))
+    assert cache.kernel_folder(key) == folder
+    (kernel if mode == 0o666 else kernel.parent).chmod(mode)
+    assert cache.kernel_folder(key) != folder
+    folder.chmod(0o700)  # nobody else may enter it
+    assert cache.kernel_folder(key) == folder
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can be two users")
 def test_a_container_with_a_random_user_does_not_use_what_another_has_left() -> None:
     with tempfile.TemporaryDirectory() as shared:

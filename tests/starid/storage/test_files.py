@@ -14,9 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from starhil.hil_tests.client.wire_log import WireLog
 from starid.attitude import Attitude, turn_text
 from starid.camera.file import load_camera
 from starid.catalog.hipparcos import read_hip2
+from starid.cli.output import prepare_output
 from starid.errors import StaridError
 from starid.identification.thesis.database import DatabaseError
 from starid.identification.thesis.database_file import load_database
@@ -35,14 +37,14 @@ READERS = [
 def test_a_pipe_receives_the_file_and_stays_a_pipe(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    seen: list[bytes] = []
+    contents: list[bytes] = []
     holder = os.open(pipe, os.O_RDWR)  # so that neither end waits for the other
     try:
         write_atomically(pipe, lambda part: part.write_bytes(b"whole"))
-        seen.append(os.read(holder, 100))
+        contents.append(os.read(holder, 100))
     finally:
         os.close(holder)
-    assert seen == [b"whole"]
+    assert contents == [b"whole"]
     assert stat.S_ISFIFO(pipe.lstat().st_mode)
 
 
@@ -68,6 +70,25 @@ def test_a_link_to_a_file_stays_a_link_and_the_file_is_replaced(tmp_path: Path) 
     assert list(target.parent.iterdir()) == [target]
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a link to another user")
+@pytest.mark.parametrize("hidden", [False, True], ids=["", "behind an own link"])
+def test_a_link_of_another_user_is_not_followed(tmp_path: Path, *, hidden: bool) -> None:
+    """In /tmp, it could lead to any file of this user, which was replaced."""
+    target, link, own = tmp_path / "precious", tmp_path / "image.png", tmp_path / "own"
+    target.write_bytes(b"precious")
+    link.symlink_to(target)
+    own.symlink_to(link.name)
+    os.lchown(link, 12345, 12345)
+    path = own if hidden else link
+    with pytest.raises(PermissionError, match="a link that user 12345 has made"):
+        write_atomically(path, lambda part: part.write_bytes(b"whole"))
+    with pytest.raises(StaridError, match=r"cannot be written \(a link that user 12345 has made\)"):
+        prepare_output(path, "-o")
+    with pytest.raises(PermissionError, match="a link that user 12345 has made"):
+        WireLog(path)
+    assert target.read_bytes() == b"precious"
+
+
 def test_a_folder_is_not_overwritten(tmp_path: Path) -> None:
     with pytest.raises(IsADirectoryError):
         write_atomically(tmp_path, lambda part: part.write_bytes(b"whole"))
@@ -85,24 +106,24 @@ def test_standard_output_is_written_in_place(tmp_path: Path, *, into_file: bool)
     if into_file:
         with file.open("wb") as stream:
             subprocess.run(command, stdout=stream, check=True, timeout=PATIENCE_S)
-        said = file.read_text()
+        text = file.read_text()
     else:
-        said = subprocess.run(
+        text = subprocess.run(
             command, stdout=subprocess.PIPE, text=True, check=True, timeout=PATIENCE_S
         ).stdout
-    assert said == "before\nwhole\nafter\n"
+    assert text == "before\nwhole\nafter\n"
     assert link.is_symlink()
 
 
 def test_a_stream_without_a_suffix_gets_a_png(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
-    seen: list[bytes] = []
-    reader = threading.Thread(target=lambda: seen.append(pipe.read_bytes()), daemon=True)
+    contents: list[bytes] = []
+    reader = threading.Thread(target=lambda: contents.append(pipe.read_bytes()), daemon=True)
     reader.start()
     write_image(pipe, np.arange(64, dtype=np.uint8).reshape(8, 8))
     reader.join(timeout=PATIENCE_S)
-    assert seen[0].startswith(b"\x89PNG")
+    assert contents[0].startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(("reader", "error_type"), READERS)

@@ -37,7 +37,7 @@ def device(profile: str) -> EcssDevice:
 @cache
 def answers(profile: str, rate_deg_s: float) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """Of each sequence: errors over stated ones, squared (n, 3); angles between the boresights, degrees; and stated probabilities."""
-    unit, found = device(profile), []
+    unit, sequences = device(profile), []
     for number in range(SEQUENCES):
         rng = np.random.default_rng((45, number))
         attitude, axis = random_attitude(rng), rng.normal(size=3)
@@ -62,8 +62,8 @@ def answers(profile: str, rate_deg_s: float) -> list[tuple[np.ndarray, np.ndarra
                 wrong.append(solution.probability_false)
             attitude = propagate(attitude, rate, 1.0)
         if squares:
-            found.append((np.array(squares), np.array(off), np.array(wrong)))
-    return found
+            sequences.append((np.array(squares), np.array(off), np.array(wrong)))
+    return sequences
 
 
 CASES = [(profile, rate) for profile in ("ideal", "cubestar", "thesis") for rate in (0.0, 0.3, 2.0)]
@@ -85,9 +85,9 @@ def test_places_are_wrong_as_often_as_stated(profile: str, rate_deg_s: float) ->
     for low, high in ((0.0, LIKELY_RIGHT), (LIKELY_RIGHT, 1.01)):
         excess = variance = 0.0
         for _, off, wrong in answers(profile, rate_deg_s):
-            chosen = (wrong >= low) & (wrong < high)
-            if chosen.any():
-                stated = wrong[chosen].mean()
-                excess += float(np.sum((off[chosen] > RIGHT_DEG) - wrong[chosen]))
-                variance += np.count_nonzero(chosen) ** 2 * stated * (1.0 - stated)
+            in_class = (wrong >= low) & (wrong < high)
+            if in_class.any():
+                stated = wrong[in_class].mean()
+                excess += float(np.sum((off[in_class] > RIGHT_DEG) - wrong[in_class]))
+                variance += np.count_nonzero(in_class) ** 2 * stated * (1.0 - stated)
         assert abs(excess) <= SIGMAS * math.sqrt(variance)

@@ -14,6 +14,8 @@ from starhil.emulator.sensor.pipeline.photometry import _limit_of
 from starhil.emulator.truth.source import TruthState
 from starid.attitude import Attitude, propagate
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize(("profile", "low", "high"), [("cubestar", 3.25, 3.75), ("ideal", 5.5, 6.0)])
 def test_the_features_stop_where_the_detector_does(profile, low, high):

@@ -161,8 +161,8 @@ def test_frames_are_solved_while_another_index_is_built_and_then_the_new_limit_h
     pipeline = Pipeline(setup)
     magnitude = dict(zip(pipeline.catalog.hip.tolist(), pipeline.catalog.v.tolist(), strict=True))
     truth = Attitude.from_radec_roll(83.8, -1.2, 0.0)
-    asked = FrameRequest(0, TruthState(truth, ZERO_RATE), 0.1, 1.0, setup.settings)
-    bright = replace(asked, settings=replace(asked.settings, limiting_magnitude=4.0))
+    frame = FrameRequest(0, TruthState(truth, ZERO_RATE), 0.1, 1.0, setup.settings)
+    bright = replace(frame, settings=replace(frame.settings, limiting_magnitude=4.0))
 
     def solve(request):
         result = pipeline.handle(request)
@@ -171,7 +171,7 @@ def test_frames_are_solved_while_another_index_is_built_and_then_the_new_limit_h
         assert error.cross_boresight_arcsec < ACCURACY_ARCSEC
         return result
 
-    before = solve(asked)
+    before = solve(frame)
     assert not before.index_pending
     meanwhile = solve(bright)
     assert meanwhile.index_pending

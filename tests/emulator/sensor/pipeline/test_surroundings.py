@@ -113,7 +113,7 @@ def test_a_covered_lens_leaves_too_few_stars_lost_in_space_and_tracking(pipeline
 
 def test_the_modelled_direction_of_a_star_is_that_of_the_catalogue_not_the_measured_one(pipeline):
     catalog = load_catalog(epoch=Profile().epoch)
-    wanted = {int(hip): vector for hip, vector in zip(catalog.hip, catalog.vectors, strict=True)}
+    vector_of = {int(hip): vector for hip, vector in zip(catalog.hip, catalog.vectors, strict=True)}
     moved = replace(REQUEST, index=30, observer_velocity=np.array((20_000.0, -20_000.0, 5_000.0)))
     for request in (replace(REQUEST, index=31), moved):
         result = pipeline.handle(request)
@@ -121,7 +121,7 @@ def test_the_modelled_direction_of_a_star_is_that_of_the_catalogue_not_the_measu
         measured = measured @ Attitude(np.array(result.quaternion_xyzw)).matrix
         modelled = np.array([star.icrs for star in result.stars])
         assert len(modelled) > 10
-        assert modelled == pytest.approx(np.array([wanted[star.hip] for star in result.stars]), abs=1e-12)
+        assert modelled == pytest.approx(np.array([vector_of[star.hip] for star in result.stars]), abs=1e-12)
         assert np.abs(measured - modelled).max() > 1e-6
 
 

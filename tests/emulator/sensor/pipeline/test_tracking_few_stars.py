@@ -15,6 +15,8 @@ from starhil.emulator.sensor.pipeline.pipeline import Pipeline
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 
+pytestmark = pytest.mark.long
+
 PREDICTION_ARCSEC = np.array([20.0, 20.0, 35.0])
 """Error of a prediction that is good to 0.12 px."""
 

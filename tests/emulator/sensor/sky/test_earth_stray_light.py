@@ -86,9 +86,9 @@ def test_it_is_off_by_default_and_a_dark_earth_or_one_behind_the_lens_gives_none
 def test_it_costs_stars():
     camera, sensor = Camera.from_fov(42.0, width=400, height=400), SensorModel()
     renderer, at = Renderer(camera, load_catalog(), sensor, 3), Attitude.from_radec_roll(83.8, -1.2, 0.0)
-    found = []
+    levels = []
     for share in (0.0, 1e-3, 3e-3):
         earth = EarthLimb(83.8 + 105.0, 0.0, radius_deg=64.0, stray_share=share)
         frame = renderer.render(at, objects=SkyObjects(earth=earth))
-        found.append(len(detect(frame.image, sensor.detection_settings())))
-    assert found[0] > found[1] > found[2]
+        levels.append(len(detect(frame.image, sensor.detection_settings())))
+    assert levels[0] > levels[1] > levels[2]

@@ -126,13 +126,13 @@ def test_the_moon_has_its_phase_and_its_lit_side_faces_the_sun(date, share):
 
 def test_the_moon_is_displaced_for_an_observer_in_orbit():
     place = 7e6 * np.array([0.0, 0.0, 1.0])
-    geocentric, seen = (
+    geocentric, apparent = (
         BY_DATE.view(NEW_YEAR, position, np.zeros(3)).objects.moon for position in (None, place)
     )
-    shift = angle(*(icrs_vector(moon.ra_deg, moon.dec_deg) for moon in (geocentric, seen)))
+    shift = angle(*(icrs_vector(moon.ra_deg, moon.dec_deg) for moon in (geocentric, apparent)))
     expected = 7e6 * math.cos(math.radians(geocentric.dec_deg)) / 3.62e8
     assert shift == pytest.approx(expected, rel=0.03)
-    assert seen.dec_deg < geocentric.dec_deg
+    assert apparent.dec_deg < geocentric.dec_deg
 
 
 def test_stars_have_parallax_and_aberration():
@@ -268,7 +268,7 @@ def blinded_by_geometry(
 
 def switches(blinded, step_s: int = 20) -> list[int]:
     """Whole seconds of an orbit from which a condition is another, searched in steps that are then halved."""
-    found = []
+    angles = []
     for start in range(0, ORBIT_S, step_s):
         low, high = start, start + step_s
         if blinded(low) == blinded(high):
@@ -276,8 +276,8 @@ def switches(blinded, step_s: int = 20) -> list[int]:
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (middle, high) if blinded(middle) == blinded(low) else (low, middle)
-        found.append(high)
-    return found
+        angles.append(high)
+    return angles
 
 
 @pytest.mark.parametrize(("off_sun_deg", "earth_deg"), [(25.0, 20.0), (70.0, 25.0), (150.0, 10.0)])
@@ -363,7 +363,7 @@ def test_a_body_that_a_fault_places_looks_as_in_the_profile(bodies):
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "message"),
     [
         ({"bodies": "all"}, "bodies: must be one of 'typed', 'ephemeris' (given: 'all')"),
         ({"aberration": 1}, "aberration: must be true or false (given: 1)"),
@@ -382,8 +382,8 @@ def test_a_body_that_a_fault_places_looks_as_in_the_profile(bodies):
         ),
     ],
 )
-def test_a_bad_sky_is_named(values, said):
+def test_a_bad_sky_is_named(values, message):
     with pytest.raises(ValidationError) as caught:
         SKY.model_validate(values)
     (problem,) = map(str, problems(caught.value, SKY, values))
-    assert problem.startswith(said)
+    assert problem.startswith(message)

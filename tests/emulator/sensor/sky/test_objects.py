@@ -131,14 +131,14 @@ def test_the_earth_is_a_sphere_with_an_atmosphere(radius_deg: float, sun: tuple[
     mean = np.zeros_like(flat)
     light.draw(mean, Backdrop(flat, flat, sky_e_s=1.0, exposure_s=1.0))
     pixels = np.argwhere(flat)[::97, ::-1]
-    seen, nadir = camera.back_project(pixels.astype(np.float64)), ORION.to_sensor(earth.direction)
-    height = (np.degrees(np.arccos(seen @ nadir)) - radius_deg) / 0.2
+    rays, nadir = camera.back_project(pixels.astype(np.float64)), ORION.to_sensor(earth.direction)
+    height = (np.degrees(np.arccos(rays @ nadir)) - radius_deg) / 0.2
     passed = np.clip(height, 0.0, 1.0)
     daylight = 1.8e6 * 10.0 ** (0.4 * 26.74) * 0.3 / np.pi * camera.pixel_scale_rad**2
     shade = (
-        np.ones(len(seen))
+        np.ones(len(rays))
         if sun is None
-        else sunlit_sphere(seen, nadir, ORION.to_sensor(icrs_vector(*sun)), earth.radius_rad)
+        else sunlit_sphere(rays, nadir, ORION.to_sensor(icrs_vector(*sun)), earth.radius_rad)
     )
     glow = np.where(height < 20.0, np.exp(-np.maximum(height, 0.0)), 0.0)
     expected = passed + daylight * shade * glow

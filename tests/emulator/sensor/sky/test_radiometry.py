@@ -107,16 +107,16 @@ def test_a_full_moon_ten_degrees_off_the_boresight_costs_the_stars_around_it(gla
     catalog = load_catalog()
     renderer = Renderer(CAMERA, catalog, sensor, seed=1)
     moon = Moon(83.8, 8.8, magnitude=-12.74, glare_share=glare_share)
-    seen = []
+    magnitudes = []
     for sky in (SkyObjects(), SkyObjects(moon=moon)):
         frame = renderer.render(ORION, objects=sky)
         off_deg = np.degrees(np.arccos(catalog.vectors[frame.stars.catalog_index] @ moon.direction))
         around = (off_deg > 1.5) & (off_deg < 6.0)
         xy = detect(frame.image, sensor.detection_settings()).xy_px
         gaps = np.linalg.norm(frame.stars.xy_px[around][:, None] - xy, axis=2).min(axis=1)
-        seen.append(np.count_nonzero(gaps < 2.0))
-    assert seen[0] >= 15
-    assert most - 0.3 < seen[1] / seen[0] <= most
+        magnitudes.append(np.count_nonzero(gaps < 2.0))
+    assert magnitudes[0] >= 15
+    assert most - 0.3 < magnitudes[1] / magnitudes[0] <= most
 
 
 def test_a_baffle_leaves_tenfold_less_sunlight_for_each_decade_of_angle_outside_the_exclusion_angle():

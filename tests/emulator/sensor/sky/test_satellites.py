@@ -32,14 +32,14 @@ def places_km(shell: Constellation, unix_s: float) -> np.ndarray:
     radius = EARTH_KM + shell.altitude_km
     angle = math.sqrt(GM_KM3_S2 / radius**3) * unix_s
     per_plane = math.ceil(shell.count / shell.planes)
-    found = []
+    positions = []
     for number in range(shell.count):
         along, plane = divmod(number, shell.planes)
         node = Rotation.from_euler("z", 360.0 * plane / shell.planes, degrees=True)
         tilt = Rotation.from_euler("x", shell.inclination_deg, degrees=True)
         turn = Rotation.from_euler("z", angle + 2.0 * math.pi * (along / per_plane + plane / shell.count))
-        found.append((node * tilt * turn).apply([radius, 0.0, 0.0]))
-    return np.array(found)
+        positions.append((node * tilt * turn).apply([radius, 0.0, 0.0]))
+    return np.array(positions)
 
 
 def observer(altitude_km: float = 550.0) -> tuple[np.ndarray, np.ndarray]:
@@ -100,9 +100,9 @@ def test_a_trail_is_as_long_as_the_angle_that_the_satellite_moves_and_holds_its_
     )
     renderer = Renderer(camera, load_catalog(), sensor, 1)
     satellites, exposure_s = seen(), 0.3
-    found = everything(satellites, exposure_s)
-    number = int(np.argmin(np.where(found.magnitudes < 3.5, np.abs(found.magnitudes - 2.5), np.inf)))
-    begin, middle, end = found.directions[:, number]
+    light = everything(satellites, exposure_s)
+    number = int(np.argmin(np.where(light.magnitudes < 3.5, np.abs(light.magnitudes - 2.5), np.inf)))
+    begin, middle, end = light.directions[:, number]
     place, velocity = observer()
     at = [
         everything(Satellites(SHELL, UNIX_S + t, place + t * velocity, velocity, SUN)).directions[1]
@@ -125,7 +125,7 @@ def test_a_trail_is_as_long_as_the_angle_that_the_satellite_moves_and_holds_its_
     extra_e = (frame.image.astype(float) - still.image).sum() * sensor.gain_e_per_dn
     inside = [
         magnitude
-        for direction, magnitude in zip(found.directions[1], found.magnitudes, strict=True)
+        for direction, magnitude in zip(light.directions[1], light.magnitudes, strict=True)
         if camera.project(attitude.to_sensor(direction[None]))[1][0] and magnitude <= 6.0
     ]
     expected_e = sum(sensor.electrons(magnitude, exposure_s) for magnitude in inside)

@@ -67,15 +67,15 @@ def test_a_covered_field_is_solved(share: float) -> None:
 def test_a_cluttered_field_is_solved_by_its_parts() -> None:
     settings = SceneSettings(5.5, 0.5, false_stars=200, cluttered=0.5)
     whole = Identifier(effort=Effort(part_stars=0))
-    found = {"parts": 0, "whole": 0}
+    counts = {"parts": 0, "whole": 0}
     for scene in scenes(settings, 40, 21):
         for name, asked in (("parts", identifier()), ("whole", whole)):
             solution = asked.identify(scene.xy_px, scene.flux)
             if solution.valid:
-                found[name] += 1
+                counts[name] += 1
                 assert solution.attitude.error_to(scene.attitude).cross_boresight_arcsec < WRONG_ARCSEC
-    assert found["parts"] >= 39
-    assert found["whole"] <= 25
+    assert counts["parts"] >= 39
+    assert counts["whole"] <= 25
 
 
 def test_a_field_with_a_mirrored_half_is_right_or_rejected() -> None:
@@ -92,15 +92,15 @@ def test_a_field_with_a_mirrored_half_is_right_or_rejected() -> None:
     assert valid >= 27
 
 
-@pytest.mark.parametrize("given", [False, True])
-def test_the_covariance_matches_the_errors(given: bool) -> None:
+@pytest.mark.parametrize("with_sigmas", [False, True])
+def test_the_covariance_matches_the_errors(with_sigmas: bool) -> None:
     rng = np.random.default_rng(23)
     total, solved = 0.0, 0
     for scene in scenes(SceneSettings(5.5, 0.0), 200, 24):
         n = len(scene.xy_px)
-        sigma = rng.uniform(0.2, 2.0, (n, 2)) if given else np.full((n, 2), 1.5)
+        sigma = rng.uniform(0.2, 2.0, (n, 2)) if with_sigmas else np.full((n, 2), 1.5)
         xy = scene.xy_px + sigma * rng.standard_normal((n, 2))
-        solution = identifier().identify(xy, scene.flux, sigma if given else None)
+        solution = identifier().identify(xy, scene.flux, sigma if with_sigmas else None)
         error = solution.attitude.error_to(scene.attitude).rotation_vector_rad
         total += float(error @ np.linalg.solve(solution.covariance, error))
         solved += 1

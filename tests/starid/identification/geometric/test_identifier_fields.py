@@ -40,7 +40,7 @@ CAMERAS = {
 @pytest.mark.parametrize("name", CAMERAS)
 def test_fields_of_5_to_90_degrees(name: str) -> None:
     camera = CAMERAS[name]
-    asked = Identifier(camera)
+    identifier = Identifier(camera)
     rng = np.random.default_rng(8)
     error_px, count = 0.3, 8
     for i in range(count):
@@ -49,11 +49,11 @@ def test_fields_of_5_to_90_degrees(name: str) -> None:
             attitude,
             i,
             camera=camera,
-            limit=float(asked.stars.v.max()) - 0.5,
+            limit=float(identifier.stars.v.max()) - 0.5,
             sigma_px=error_px,
-            identified=asked,
+            identified=identifier,
         )
-        solution = asked.identify(xy, flux)
+        solution = identifier.identify(xy, flux)
         assert solution.valid, (i, solution.reason, len(xy))
         error = solution.attitude.error_to(attitude)
         assert error.cross_boresight_arcsec < 6.0 * solution.cross_boresight_sigma_arcsec
@@ -66,13 +66,13 @@ def test_fields_of_5_to_90_degrees(name: str) -> None:
 @pytest.mark.parametrize("factor", [0.93, 1.06])
 def test_an_unknown_focal_length_is_found(model: str, fov_deg: float, factor: float) -> None:
     nominal = Camera.from_fov(fov_deg, 1024, 1024, model=model)
-    asked = Identifier(nominal, fov_tolerance=0.1)
+    identifier = Identifier(nominal, fov_tolerance=0.1)
     camera = scaled_camera(nominal, factor)
     rng = np.random.default_rng(9)
     for i in range(3):
         attitude = random_attitude(rng)
-        xy, flux, _ = sky(attitude, i, camera=camera, limit=6.5, identified=asked)
-        solution = asked.identify(xy, flux)
+        xy, flux, _ = sky(attitude, i, camera=camera, limit=6.5, identified=identifier)
+        solution = identifier.identify(xy, flux)
         assert solution.valid
         assert solution.camera is not None
         assert solution.camera.focal_px[0] == pytest.approx(camera.focal_px[0], rel=2e-3)
@@ -80,22 +80,22 @@ def test_an_unknown_focal_length_is_found(model: str, fov_deg: float, factor: fl
 
 
 def test_random_points_are_rejected_at_an_unknown_focal_length_too() -> None:
-    asked = Identifier(Camera.from_fov(25.0, 1024, 1024), fov_tolerance=0.1)
+    identifier = Identifier(Camera.from_fov(25.0, 1024, 1024), fov_tolerance=0.1)
     rng = np.random.default_rng(10)
     for _ in range(4):
         n = int(rng.integers(20, 100))
         points = rng.uniform(0.0, 1023.0, (n, 2))
-        assert not asked.identify(points, 10.0 ** rng.uniform(0.0, 1.5, n)).valid
+        assert not identifier.identify(points, 10.0 ** rng.uniform(0.0, 1.5, n)).valid
 
 
 def test_a_refined_camera_is_used_as_calibrated() -> None:
     nominal = Camera.from_fov(25.0, 1024, 1024)
     camera = scaled_camera(nominal, 1.04)
-    asked = Identifier(nominal, fov_tolerance=0.1)
+    identifier = Identifier(nominal, fov_tolerance=0.1)
     attitude = Attitude.from_radec_roll(80.0, 10.0, 30.0)
-    xy, flux, _ = sky(attitude, camera=camera, limit=6.0, identified=asked)
-    assert not asked.with_camera(nominal).identify(xy, flux).valid
-    solution = asked.with_camera(camera).identify(xy, flux)
+    xy, flux, _ = sky(attitude, camera=camera, limit=6.0, identified=identifier)
+    assert not identifier.with_camera(nominal).identify(xy, flux).valid
+    solution = identifier.with_camera(camera).identify(xy, flux)
     assert solution.valid
     assert solution.camera is None
     assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC

@@ -216,32 +216,32 @@ SCENE = SceneSettings(5.5, 0.5)
 
 
 def tracked(
-    settings: SceneSettings, prediction_px: float, *, known: bool = True, window_px: float | None = None
+    settings: SceneSettings, prediction_px: float, *, with_errors: bool = True, window_px: float | None = None
 ) -> list[tuple[Solution, float]]:
     """Solutions of scenes near a prediction, and the error of each in units of its own covariance."""
     rng = np.random.default_rng(17)
-    found = []
+    answers = []
     for _ in range(FEW):
         scene = maker().scene(settings, rng)
         predicted = scene.attitude.rotated(prediction_px * PIXEL * rng.standard_normal(3))
-        errors = np.full(len(scene.flux), settings.sigma_px) if known else None
+        errors = np.full(len(scene.flux), settings.sigma_px) if with_errors else None
         solution = identifier().track(scene.xy_px, scene.flux, predicted, errors, window_px=window_px)
         off = math.nan
         if solution.valid:
             error = solution.attitude.error_to(scene.attitude).rotation_vector_rad
             off = math.sqrt(float(error @ np.linalg.solve(solution.covariance, error)))
-        found.append((solution, off))
-    return found
+        answers.append((solution, off))
+    return answers
 
 
-@pytest.mark.parametrize("known", [False, True])
-def test_three_stars_near_a_prediction_are_enough(known: bool) -> None:
-    found = tracked(replace(SCENE, kept=3), 3.0, known=known)
-    assert sum(solution.valid for solution, _ in found) >= 0.95 * FEW
-    right = [off for solution, off in found if solution.valid]
+@pytest.mark.parametrize("with_errors", [False, True])
+def test_three_stars_near_a_prediction_are_enough(with_errors: bool) -> None:
+    answers = tracked(replace(SCENE, kept=3), 3.0, with_errors=with_errors)
+    assert sum(solution.valid for solution, _ in answers) >= 0.95 * FEW
+    right = [off for solution, off in answers if solution.valid]
     # a Student distribution with 3 degrees of freedom has long tails, with 13 it does not
-    assert max(right) < (30.0 if not known else 7.0)
-    assert all(solution.star_count == 3 for solution, _ in found if solution.valid)
+    assert max(right) < (30.0 if not with_errors else 7.0)
+    assert all(solution.star_count == 3 for solution, _ in answers if solution.valid)
 
 
 def test_two_stars_are_enough_if_errors_and_window_are_small() -> None:
@@ -254,7 +254,7 @@ def test_two_stars_in_a_wide_window_or_of_unknown_error_are_not_enough() -> None
     wide = tracked(replace(SCENE, kept=2), 3.0)
     assert not any(solution.valid for solution, _ in wide)
     assert {solution.reason for solution, _ in wide} == {Reason.PREDICTION_LOST}
-    unknown = tracked(replace(SCENE, sigma_px=0.05, kept=2), 0.3, known=False, window_px=2.0)
+    unknown = tracked(replace(SCENE, sigma_px=0.05, kept=2), 0.3, with_errors=False, window_px=2.0)
     assert {solution.reason for solution, _ in unknown} == {Reason.TOO_FEW_STARS}
 
 

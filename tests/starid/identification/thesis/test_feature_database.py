@@ -87,13 +87,13 @@ def test_stored_codes_are_within_half_a_step_of_the_exact_features():
 
 
 def test_threads_and_progress_do_not_change_the_result():
-    seen = []
+    sizes = []
     parameters = DatabaseParameters(overlap=0.9)
-    one = build_database(thesis_catalog(), parameters, threads=1, progress=lambda a, b: seen.append((a, b)))
+    one = build_database(thesis_catalog(), parameters, threads=1, progress=lambda a, b: sizes.append((a, b)))
     three = build_database(thesis_catalog(), parameters, threads=3)
     np.testing.assert_array_equal(one.features, three.features)
     np.testing.assert_array_equal(one.theta, three.theta)
-    assert seen[-1] == (2 * one.cells, 2 * one.cells)
+    assert sizes[-1] == (2 * one.cells, 2 * one.cells)
 
 
 def test_spherical_features_do_not_depend_on_the_pole():

@@ -54,11 +54,11 @@ def test_the_exact_neighbour_matches_full_precision():
     for cell in range(made.cells):
         exact_vector(lsi.arrays, cell, sums, full[cell])
     tree = cKDTree(full)
-    found = np.empty(2)
+    outcome = np.empty(2)
     for observation in observations(96.0, 20, 0.13):
-        cell = exact_nearest(lsi.index, lsi.arrays, observation, found)
+        cell = exact_nearest(lsi.index, lsi.arrays, observation, outcome)
         expected, _ = tree.query(observation)
-        assert found[0] == pytest.approx(expected, abs=1e-9)
+        assert outcome[0] == pytest.approx(expected, abs=1e-9)
         assert np.linalg.norm(full[cell] - observation) == pytest.approx(expected, abs=1e-9)
 
 

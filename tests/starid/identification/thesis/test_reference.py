@@ -94,12 +94,12 @@ def test_the_solver_of_scikit_learn_finds_the_cells_and_weights_of_the_compiled_
         assert theirs.nearest == ours.nearest
         assert theirs.distance == pytest.approx(ours.distance, abs=1e-6)
         np.testing.assert_allclose(theirs.dictionary, ours.dictionary)
-        least, found = (
+        least, errors = (
             minimised(ours.dictionary, observation, omega, ours.mse.penalty)
             for omega in (ours.mse.omega, theirs.mse.omega)
         )
         assert theirs.mse.penalty == ours.mse.penalty
-        assert least - 1e-9 <= found <= least + 1e-3
+        assert least - 1e-9 <= errors <= least + 1e-3
 
 
 def test_the_search_of_scikit_learn_lists_the_nearest_cells():

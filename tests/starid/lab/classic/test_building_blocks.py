@@ -134,11 +134,11 @@ def test_patterns_are_alike_at_the_angle_between_them() -> None:
 def test_the_largest_group_has_the_true_matches() -> None:
     stars = sky(50, 5)
     turn = Rotation.random(random_state=1)
-    seen = turn.apply(stars[:8])
+    turned = turn.apply(stars[:8])
     true = np.column_stack([np.arange(8), np.arange(8)])
     rng = np.random.default_rng(3)
     wrong = np.column_stack([rng.integers(0, 8, 30), rng.integers(8, 50, 30)])
-    group = largest_group(seen, stars, np.concatenate([wrong, true]), 1e-3)
+    group = largest_group(turned, stars, np.concatenate([wrong, true]), 1e-3)
     assert np.array_equal(group, true)
 
 

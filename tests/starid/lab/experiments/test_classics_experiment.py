@@ -48,14 +48,14 @@ def test_flat_frames_have_the_thesis_number_of_stars_on_its_scale():
 def test_the_experiment_prints_published_beside_ours(tmp_path, monkeypatch):
     import dataclasses
 
-    known = registry.experiments()["classics"]
+    experiment = registry.experiments()["classics"]
     parameters = {
         "algorithms": ["pyramid", "match-group", "geometric"],
         "skies": ["flat", "sphere"],
         "cases": ["none", "false-1"],
         "every": 425,
     }
-    small = dataclasses.replace(known, full=parameters)
+    small = dataclasses.replace(experiment, full=parameters)
     outcome = runner.run([small], tmp_path, jobs=1)[0].outcome
     assert not outcome.failed
     rows = {row.quantity: row for row in outcome.rows}

@@ -200,15 +200,15 @@ def test_results_do_not_depend_on_the_number_of_processes(tmp_path):
 
 
 def test_progress_counts_up_to_all_parts(tmp_path):
-    seen: list[tuple[str, int, int]] = []
+    progress: list[tuple[str, int, int]] = []
     runner.run(
         [_experiment(), dataclasses.replace(_experiment("other"), alone=True)],
         tmp_path,
         jobs=1,
-        progress=lambda *step: seen.append(step),
+        progress=lambda *step: progress.append(step),
     )
-    assert [(done, total) for _, done, total in seen] == [(i, 6) for i in range(1, 7)]
-    assert [name for name, _, _ in seen[3:]] == ["other"] * 3
+    assert [(done, total) for _, done, total in progress] == [(i, 6) for i in range(1, 7)]
+    assert [name for name, _, _ in progress[3:]] == ["other"] * 3
 
 
 @pytest.mark.parametrize(
@@ -533,13 +533,13 @@ def test_every_published_line_has_its_place_in_the_thesis_and_a_check_that_can_b
     assert len(lines) == len(PUBLISHED)
     for line in lines + tables.read_lines("columns.csv"):
         assert line["source"].startswith(("section ", "table", "figure", "eq. ")), line
-    for (experiment, quantity), known in PUBLISHED.items():
+    for (experiment, quantity), published in PUBLISHED.items():
         assert experiment in names
-        if known.check:
-            values = known.numbers or [1.0]
-            value = values if known.check == "same" or len(values) > 1 else values[0]
-            key = "ours" if known.check in ("more", "less") else "author"
-            assert compared(quantity, known, **{key: value}, trials=100).of == len(values)
+        if published.check:
+            values = published.numbers or [1.0]
+            value = values if published.check == "same" or len(values) > 1 else values[0]
+            key = "ours" if published.check in ("more", "less") else "author"
+            assert compared(quantity, published, **{key: value}, trials=100).of == len(values)
 
 
 def test_parts_are_the_combinations_of_lists_values_and_parameters():

@@ -52,11 +52,11 @@ def test_every_solver_of_our_own_answers_the_same_scenes() -> None:
 def test_an_answer_off_the_truth_is_wrong_even_where_the_true_matches_give_no_better(
     off_truth: float, off_fit: float, counts: tuple[int, int]
 ) -> None:
-    found = Attitude.from_radec_roll(10.0, 20.0, 30.0)
-    truth, fit = (found.rotated([0.0, np.radians(angle), 0.0]) for angle in (off_truth, off_fit))
+    attitude = Attitude.from_radec_roll(10.0, 20.0, 30.0)
+    truth, fit = (attitude.rotated([0.0, np.radians(angle), 0.0]) for angle in (off_truth, off_fit))
     scene = Scene(truth, np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.int64), 0.5)
     tally = Tally("tracking, 3 stars", "geometric")
-    tally.add(scene, fit, Reply(found.matrix, 1e-3, 1e-3))
+    tally.add(scene, fit, Reply(attitude.matrix, 1e-3, 1e-3))
     report = tally.report()
     assert (report["wrong"], report["ill_conditioned"]) == counts
 

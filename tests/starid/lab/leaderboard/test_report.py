@@ -192,31 +192,31 @@ def test_a_field_is_drawn_until_it_has_its_least_number_of_stars() -> None:
 def test_raw_answers_are_not_verified_and_all_know_the_noise(
     monkeypatch: pytest.MonkeyPatch, raw: bool
 ) -> None:
-    asked: list[object] = []
+    calls: list[object] = []
 
     class Noting(Classic):
         def identify(self, *arguments):
-            asked.append(None if arguments[2] is None else float(arguments[2][0]))
+            calls.append(None if arguments[2] is None else float(arguments[2][0]))
             return Solution.invalid(Reason.NO_MATCH)
 
     def made(*_, **options):
-        asked.append(options["verify"])
+        calls.append(options["verify"])
         return Noting()
 
     monkeypatch.setattr(peers, "make_identifier", made)
     bench.run(1, 5, own=["pyramid"], rows=["2"], raw=raw)
-    assert asked[0] is not raw
-    assert asked[-1] == 2.0
+    assert calls[0] is not raw
+    assert calls[-1] == 2.0
 
 
 @pytest.mark.parametrize(("name", "even"), [("pyramid", False), ("pyramid-even", True)])
 def test_a_suffix_asks_for_evenly_spread_guide_stars(monkeypatch, name: str, even: bool) -> None:
-    given = []
+    calls = []
     monkeypatch.setattr(
-        peers, "make_identifier", lambda *words, **options: given.append((*words, options)) or Classic()
+        peers, "make_identifier", lambda *words, **options: calls.append((*words, options)) or Classic()
     )
     make_solver(name, Camera.from_fov(20.0), load_catalog().brighter_than(5.0))
-    ((algorithm, _, options),) = given
+    ((algorithm, _, options),) = calls
     assert algorithm == "pyramid"
     assert options["even"] is even
     assert options["verify"]

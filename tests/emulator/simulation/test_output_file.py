@@ -1,0 +1,28 @@
+"""Files that a run writes, in folders where others write too."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.simulation.output_file import OutputFile
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a link to another user")
+def test_a_link_that_another_user_has_made_is_not_followed(tmp_path: Path) -> None:
+    """With --overwrite it emptied any file of the run's user, where the kernel does not protect links."""
+    target, link = tmp_path / "precious", tmp_path / "log.csv"
+    target.write_bytes(b"precious")
+    link.symlink_to(target)
+    OutputFile("truth log", link, overwrite=True).close()  # its own link
+    target.write_bytes(b"precious")
+    os.lchown(link, 12345, 12345)
+    with pytest.raises(
+        EmulatorError,
+        match=r"log\.csv: cannot be written \(a link that user 12345 has made\); choose another file",
+    ):
+        OutputFile("truth log", link, overwrite=True)
+    assert target.read_bytes() == b"precious"
