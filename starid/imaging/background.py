@@ -24,6 +24,10 @@ WIDEST_BLOCK_PX: Final = 64
 MIN_NOISE_DN: Final = 1.0 / math.sqrt(12.0)
 """Standard deviation of rounding to whole counts."""
 
+_SILENT: Final = 1.001
+_MIXED: Final = 1.5
+"""Noise, in typical ones, from which a block darker than the sky is a mixture of sky and something dark."""
+
 _ROW_STEP: Final = 4
 _FIRST_SAMPLES: Final = 16
 _CLIP_SIGMA: Final = 3.5
@@ -46,8 +50,9 @@ class Background:
     ----------
     level, noise : ndarray (rows, columns), float32
         Value at the centre of a block, and standard deviation about the plane through its pixels, both without
-        stars; counts. Blocks without any noise, as behind a dark body, have the typical one: between them and
-        those beside, where stars are seen, noise is not less.
+        stars; counts. Blocks that a dark body covers have the typical noise, and those at its edge the level of
+        the sky beside: between the centres of these blocks and those beside, where stars are seen, the sky is
+        neither quieter nor steep.
     block_px : float
         Side of a block; the centre of block (i, j) lies at ((j + ½)·block − ½, (i + ½)·block − ½).
     """
@@ -186,10 +191,30 @@ def estimate_background(image: GreyImage, block_px: int = BLOCK_PX) -> Backgroun
     level = np.empty((rows, columns), dtype=np.float32)
     noise = np.empty((rows, columns), dtype=np.float32)
     _block_statistics(image, block_px, level, noise)
-    lit = noise > np.float32(1.001 * MIN_NOISE_DN)
-    if lit.any():
-        noise[~lit] = median(noise[lit])
+    _replace_dark(level, noise)
     return Background(level, noise, block_px)
+
+
+def _replace_dark(level: Array32, noise: Array32) -> None:
+    """Replace blocks that are dark, all or in part, in place: sky that is darker than elsewhere has less noise, but some."""
+    silent = noise <= np.float32(_SILENT * MIN_NOISE_DN)
+    if silent.all():
+        return
+    typical_level, typical = median(level[~silent]), np.float32(median(noise[~silent]))
+    dark = (level < typical_level) & (silent | (noise > np.float32(_MIXED) * typical))
+    noise[silent | dark] = typical
+    if not dark.any():
+        return
+    rows, columns = level.shape
+    count, total = np.zeros_like(level), np.zeros_like(level)
+    known = np.pad(np.where(dark, np.float32(0.0), level), 1)
+    weight = np.pad(np.where(dark, np.float32(0.0), np.float32(1.0)), 1)
+    for row in range(3):
+        for column in range(3):
+            total += known[row : row + rows, column : column + columns]
+            count += weight[row : row + rows, column : column + columns]
+    beside = dark & (count > np.float32(0.0))
+    level[beside] = total[beside] / count[beside]
 
 
 @compiled_ieee

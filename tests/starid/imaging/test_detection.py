@@ -342,6 +342,22 @@ def test_the_width_of_few_spots_is_measured_among_hot_pixels_beside_a_dark_body(
     assert np.mean(squares) == pytest.approx(1.0, abs=4.0 / math.sqrt(len(squares)))
 
 
+def test_a_dark_body_does_not_displace_the_stars_beside_it() -> None:
+    """The sky ends at its edge: a grid of blocks on either side would make a slope of it."""
+    shape, squares = (400, 400), []
+    for seed in range(20):
+        rng = np.random.default_rng((14, seed))
+        places = np.column_stack([rng.uniform(170.0, 192.0, 10), np.arange(20.0, 400.0, 38.0)])
+        image = photograph(sum(spot(shape, *place, 400.0, 1.2) for place in places), seed)
+        image[:, 203:] = 0
+        found = detect(image, KNOWN)
+        number, _ = matched(found, places, 3.0)
+        error = found.xy_px[number[number >= 0]] - places[number >= 0]
+        squares += np.square(error / found.xy_sigma_px[number[number >= 0]]).mean(axis=1).tolist()
+    assert len(squares) > 190
+    assert np.mean(squares) == pytest.approx(1.0, abs=4.0 / math.sqrt(len(squares)))
+
+
 def test_two_streaks_among_few_round_stars_are_not_trails() -> None:
     shape = (300, 300)
     places = scattered(6, shape, 9, gap=40.0)
