@@ -26,7 +26,7 @@ MIN_NOISE_DN: Final = 1.0 / math.sqrt(12.0)
 
 _SILENT: Final = 1.001
 _MIXED: Final = 1.5
-"""Noise, in typical ones, from which a block darker than the sky is a mixture of sky and something dark."""
+"""Noise, in typical ones, from which a block beside a black one is a mixture of it and the sky."""
 
 _ROW_STEP: Final = 4
 _FIRST_SAMPLES: Final = 16
@@ -196,25 +196,32 @@ def estimate_background(image: GreyImage, block_px: int = BLOCK_PX) -> Backgroun
 
 
 def _replace_dark(level: Array32, noise: Array32) -> None:
-    """Replace blocks that are dark, all or in part, in place: sky that is darker than elsewhere has less noise, but some."""
+    """Replace blocks that a body without any light and noise covers, all or in part, in place."""
     silent = noise <= np.float32(_SILENT * MIN_NOISE_DN)
-    if silent.all():
+    if silent.all() or not silent.any():
         return
-    typical_level, typical = median(level[~silent]), np.float32(median(noise[~silent]))
-    dark = (level < typical_level) & (silent | (noise > np.float32(_MIXED) * typical))
-    noise[silent | dark] = typical
-    if not dark.any():
-        return
-    rows, columns = level.shape
-    count, total = np.zeros_like(level), np.zeros_like(level)
-    known = np.pad(np.where(dark, np.float32(0.0), level), 1)
-    weight = np.pad(np.where(dark, np.float32(0.0), np.float32(1.0)), 1)
+    sky, typical = median(level[~silent]), np.float32(median(noise[~silent]))
+    noise[silent] = typical
+    black = silent & (level < sky)
+    mixed = (
+        (level < sky) & (noise > np.float32(_MIXED) * typical) & (_sums_of_nine(black.astype(np.float32)) > 0)
+    )
+    dark = black | mixed
+    noise[dark] = typical
+    total = _sums_of_nine(np.where(dark, np.float32(0.0), level))
+    count = _sums_of_nine(np.where(dark, np.float32(0.0), np.float32(1.0)))
+    beside = dark & (count > 0)
+    level[beside] = total[beside] / count[beside]
+
+
+def _sums_of_nine(values: Array32) -> Array32:
+    """Sums (rows, columns) of each value of a grid and its eight neighbours."""
+    rows, columns = values.shape
+    padded, total = np.pad(values, 1), np.zeros_like(values)
     for row in range(3):
         for column in range(3):
-            total += known[row : row + rows, column : column + columns]
-            count += weight[row : row + rows, column : column + columns]
-    beside = dark & (count > np.float32(0.0))
-    level[beside] = total[beside] / count[beside]
+            total += padded[row : row + rows, column : column + columns]
+    return total
 
 
 @compiled_ieee
