@@ -1,8 +1,8 @@
 """Errors planted in the running product, so that whatever shares its code has them: a text in a module becomes another.
 
 The changed module is compiled, and its functions that exist get the new code, wherever they have been imported to; constants
-of the module are replaced in it. A text that is not there exactly once raises `LostAimError`: move the aim, do not drop the
-error.
+of the module are replaced in it. A text that is not there exactly once, or whose change reaches nothing that exists, raises
+`LostAimError`: move the aim, do not drop the error.
 """
 
 from __future__ import annotations
@@ -12,12 +12,14 @@ import functools
 import gc
 import importlib
 import sys
+import tomllib
 import types
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 _CONSTANTS = (bool, int, float, str, bytes, tuple, frozenset, dict)
 
@@ -36,6 +38,31 @@ class Edit:
     at: str
     before: str
     after: str
+
+
+@dataclass(frozen=True)
+class PlantedDefect:
+    """Changes that make one error."""
+
+    name: str
+    edits: tuple[Edit, ...]
+
+    def planted(self) -> AbstractContextManager[None]:
+        """Put the error into the running product."""
+        return planted(*self.edits)
+
+
+Listed = TypeVar("Listed", bound=PlantedDefect)
+
+
+def read_defects(file: Path, kind: type[Listed]) -> tuple[Listed, ...]:
+    """Return the errors that a file lists as tables `mutant`."""
+    found = []
+    for table in tomllib.loads(file.read_text(encoding="utf-8"))["mutant"]:
+        edits = tuple(Edit(**edit) for edit in table.pop("edits"))
+        others = {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
+        found.append(kind(edits=edits, **others))
+    return tuple(found)
 
 
 @contextmanager
@@ -96,21 +123,28 @@ def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
     new, old = (_by_name(code) for code in (compiled, compile(Path(file).read_text("utf-8"), file, "exec")))
     fresh = {key: value for key, value in vars(module).items() if key.startswith("__")}
     exec(compiled, fresh)
-    undo = ExitStack()
+    undo, changes = ExitStack(), 0
     for function in [item for item in gc.get_objects() if type(item) is types.FunctionType]:
         code = function.__code__
         ours = function.__globals__ is vars(module) and code.co_filename == file  # not made by a decorator
         if not ours or len(new[code.co_qualname]) != len(old[code.co_qualname]):
             continue
         nth = [each.co_firstlineno for each in old[code.co_qualname]].index(code.co_firstlineno)
-        if (changed := new[code.co_qualname][nth]).co_freevars == code.co_freevars:
+        changed = new[code.co_qualname][nth]
+        if changed.co_freevars == code.co_freevars:
+            changes += _meaning(changed) != _meaning(code)
             function.__code__ = changed
             undo.callback(setattr, function, "__code__", code)
     for key, value in [*vars(module).items()]:
         if type(value) in _CONSTANTS and key in fresh and fresh[key] != value and not key.startswith("__"):
             setattr(module, key, fresh[key])
             undo.callback(setattr, module, key, value)
+            changes += 1
     with undo:
+        if not changes:
+            raise LostAimError(
+                f"{module.__name__}: the change reaches no function and no constant that exists"
+            )
         yield
 
 
@@ -125,6 +159,14 @@ def _by_name(code: types.CodeType) -> defaultdict[str, list[types.CodeType]]:
     for group in codes.values():
         group.sort(key=lambda item: item.co_firstlineno)
     return codes
+
+
+def _meaning(code: types.CodeType) -> tuple[object, ...]:
+    """Return what a function does, wherever its lines are."""
+    constants = [
+        _meaning(item) if isinstance(item, types.CodeType) else repr(item) for item in code.co_consts
+    ]
+    return code.co_code, code.co_names, code.co_varnames, code.co_freevars, *constants
 
 
 def _forget() -> None:

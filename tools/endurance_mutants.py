@@ -1,69 +1,54 @@
-"""Plant each defect of tests/hil_tests/endurance/mutants.toml in a copy of the project and let endurance runs find it.
+"""Plant each defect of tests/hil_tests/endurance/mutants.toml in the running product and let endurance runs find it.
 
 python tools/endurance_mutants.py [--minutes 10] [--only WORDS]
 
-Prints the processor time and the violation with which each was found. The exit status is 1 if one was not found.
+Each defect has a process of its own. Prints the processor time and the violation with which each was found. The exit status is 1
+if one was not found.
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import shutil
-import subprocess
+import itertools
+import logging
 import sys
-import tempfile
-import tomllib
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-MUTANTS = ROOT / "tests" / "hil_tests" / "endurance" / "mutants.toml"
-PACKAGES = ("starhil", "emulator", "protocol", "hil_tests", "configs", "starid")
-SEARCH = """
-import itertools, logging, sys, time
-from starhil.emulator.cli.endurance import run_once
-from starhil.emulator.launch.unit_in_memory import links_of
-from starhil.hil_tests.endurance.life import make_life
-from starhil.hil_tests.judge.definition import unit_of
-from starhil.protocol.unit import load_unit
-from starhil.protocol.files.bundled import bundled_units
-logging.getLogger("starhil").addHandler(logging.NullHandler())
-logging.getLogger("starhil").propagate = False
-end = float(sys.argv[1])
-for number, unit in enumerate(itertools.cycle(sorted(bundled_units()))):
-    seed = 1 + number // len(bundled_units())
-    icd = load_unit(unit)
-    outcome = run_once(make_life(unit_of(icd), unit, links_of(icd), seed, 400))
-    if outcome.violation:
-        print(f"{time.process_time():.0f} s, {unit} seed {seed}: {outcome.violation}")
-    if outcome.violation or time.process_time() > end:
-        break
-"""
-"""Lives the lives of one seed after the other, of all units in turns, until a violation or the end of the time."""
+sys.path.insert(0, str(ROOT))
+
+from starhil.emulator.cli.endurance import run_once  # noqa: E402
+from starhil.emulator.launch.unit_in_memory import links_of  # noqa: E402
+from starhil.hil_tests.endurance.life import make_life  # noqa: E402
+from starhil.hil_tests.judge.definition import unit_of  # noqa: E402
+from starhil.protocol.files.bundled import bundled_units  # noqa: E402
+from starhil.protocol.unit import load_unit  # noqa: E402
+from tests.planted import PlantedDefect, read_defects  # noqa: E402
+
+MUTANTS = read_defects(ROOT / "tests/hil_tests/endurance/mutants.toml", PlantedDefect)
+STEPS = 400
 
 
-def plant(copy: Path, mutant: dict[str, str]) -> None:
-    """Plant a defect in a copy of the project; its text must occur once."""
-    path = copy / mutant["file"]
-    text = path.read_text(encoding="utf-8")
-    if text.count(mutant["before"]) != 1:
-        raise SystemExit(
-            f"{mutant['name']}: its text occurs {text.count(mutant['before'])} times in {mutant['file']}"
-        )
-    path.write_text(text.replace(mutant["before"], mutant["after"]), encoding="utf-8")
+def find(mutant: PlantedDefect, minutes: float) -> str:
+    """Return the processor time and the violation with which a defect was found, empty if it was not.
 
-
-def find(mutant: dict[str, str], minutes: float) -> str:
-    """Return the processor time and the violation with which the defect was found, empty if it was not."""
-    with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder)
-        for name in PACKAGES:
-            shutil.copytree(ROOT / name, copy / name, symlinks=True)
-        plant(copy, mutant)
-        environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
-        command = [sys.executable, "-c", SEARCH, str(60.0 * minutes)]
-        run = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True, check=False)
-    return run.stdout.strip() or ((run.stderr.splitlines() or [""])[-1] if run.returncode else "")
+    Lives the lives of one seed after the other, of all units in turns.
+    """
+    logging.getLogger("starhil").addHandler(logging.NullHandler())
+    logging.getLogger("starhil").propagate = False
+    units = sorted(bundled_units())
+    with mutant.planted():
+        for number, unit in enumerate(itertools.cycle(units)):
+            icd, seed = load_unit(unit), 1 + number // len(units)
+            outcome = run_once(make_life(unit_of(icd), unit, links_of(icd), seed, STEPS))
+            if outcome.violation:
+                return f"{time.process_time():.0f} s, {unit} seed {seed}: {outcome.violation}"
+            if time.process_time() > 60.0 * minutes:
+                break
+    return ""
 
 
 def main() -> None:
@@ -74,18 +59,14 @@ def main() -> None:
     )
     parser.add_argument("--only", default="", help="only defects whose name contains this")
     options = parser.parse_args()
-    mutants = [
-        item
-        for item in tomllib.loads(MUTANTS.read_text(encoding="utf-8"))["mutant"]
-        if options.only in item["name"]
-    ]
-    missed = []
+    mutants = [mutant for mutant in MUTANTS if options.only in mutant.name]
+    missed = 0
     for mutant in mutants:
-        violation = find(mutant, options.minutes)
-        print(f"{mutant['name']}: {violation or 'NOT FOUND'}", flush=True)
-        if not violation:
-            missed.append(mutant["name"])
-    print(f"{len(mutants) - len(missed)} of {len(mutants)} found")
+        with ProcessPoolExecutor(1, get_context("spawn")) as process:
+            violation = process.submit(find, mutant, options.minutes).result()
+        print(f"{mutant.name}: {violation or 'NOT FOUND'}", flush=True)
+        missed += not violation
+    print(f"{len(mutants) - missed} of {len(mutants)} found")
     sys.exit(bool(missed))
 
 

@@ -23,16 +23,16 @@ async def report_slow_start(algorithms: Iterable[str]) -> None:
     """Report the progress of a start with some algorithms on stderr every `PROGRESS_S`, until cancelled."""
     from starid.identification.options import ALGORITHMS
     from starid.kernels.compile_progress import CompileProgress
+    from starid.storage.cache import kernels_written_since
 
-    begin_s = time.monotonic()
+    begin_s, begin_unix_s = time.monotonic(), time.time()
     await asyncio.sleep(PROGRESS_S)
     progress = CompileProgress([PIPELINE, *(ALGORITHMS[name].module for name in algorithms)])
-    total = len(progress.kernels)
-    reason = ""
+    at_most = len(progress.kernels)  # some options need fewer
     while True:
-        compiled = progress.compiled()
-        if reason or compiled < total:
-            reason = f", {compiled} of {total} kernels compiled; later starts use them"
+        reason = ""
+        if kernels_written_since(begin_unix_s):
+            reason = f", {progress.compiled()} of at most {at_most} kernels compiled; later starts use them"
         print(f"starting: {time.monotonic() - begin_s:.0f} s{reason}", file=sys.stderr, flush=True)
         await asyncio.sleep(PROGRESS_S)
 

@@ -60,7 +60,7 @@ def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
     if name is None:
         return None
     own = icd.plugin.quantities.get(name)
-    getter: Getter = getter_of(name) if own is None else own.function
+    getter: Getter = getter_of(name) if own is None else _without_exit(name, own.function)
     if own is None and name.startswith(HEALTH):
         return _health(getter, field, icd)
     declared = quantity_of(name, icd)
@@ -194,7 +194,21 @@ def _argument_converter(field: Field, unit: str, is_bool: bool) -> Callable[[Any
 def _action_of(name: str, icd: InterfaceDefinition) -> Action:
     """Return the action of a name, of the unit's plugin or of the device."""
     own = icd.plugin.actions.get(name)
-    return ACTIONS[name] if own is None else _plugin_action(own)
+    return ACTIONS[name] if own is None else _plugin_action(_without_exit(name, own))
+
+
+def _without_exit(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of a plugin whose exit is an error of it, as any other: the device goes on."""
+
+    def call(*arguments: Any) -> Any:
+        try:
+            return function(*arguments)
+        except (Exception, KeyboardInterrupt):
+            raise
+        except BaseException as error:
+            raise RuntimeError(f"the plugin ends with {type(error).__name__} in {name}") from error
+
+    return call
 
 
 def _plugin_action(function: Callable[[Any, Mapping[str, Any]], Any]) -> Action:

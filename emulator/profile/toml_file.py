@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,11 @@ def find_toml(kind: Kind, name_or_path: str, relative_to: Path = Path()) -> Path
     failed = f"{kind} {name_or_path!r}: cannot be read"  # RuntimeError: the home folder of an unknown user
     with explained(failed, "give another path", errors=(OSError, RuntimeError)):
         path = relative_to / find(kind, name_or_path)
-        found = bool(name_or_path) and path.exists()  # an empty name is the working folder as a path
-    if not found:
-        raise EmulatorError(not_found(kind, name_or_path))
-    return path
+        with suppress(FileNotFoundError, NotADirectoryError):
+            path.stat()  # Path.exists is silent about other errors from Python 3.14 on
+            if name_or_path:  # an empty name is the working folder as a path
+                return path
+    raise EmulatorError(not_found(kind, name_or_path))
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:

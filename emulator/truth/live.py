@@ -98,6 +98,8 @@ class LiveTruth:
         self._received_s = 0.0
         """Simulation time at which the last message was accepted."""
         self._held: deque[_HeldMessage] = deque(maxlen=HISTORY)
+        self._doubts = 0
+        """How often the feed has become implausible."""
 
     def set_run(self, clock_speed: float, start_unix_s: float) -> None:
         """Set the simulation time per wall time, by default 1, 0 if time passes only on request; and the date of the run."""
@@ -128,7 +130,7 @@ class LiveTruth:
         """Count a rejected message and keep its fault in `last_fault`."""
         self.refused += 1
         self.last_fault = fault
-        if str(self.refused).rstrip("0") == "1":
+        if _is_reported(self.refused):
             log.warning("truth feed: message rejected (%d so far): %s", self.refused, fault)
 
     def _add_message(self, message: FeedMessage, received_s: float) -> None:
@@ -159,12 +161,14 @@ class LiveTruth:
         self._check_plausibility(message)
 
     def _check_plausibility(self, message: FeedMessage) -> None:
-        """Set `doubt`, and report it once."""
+        """Set `doubt`, and report it when it arises."""
         doubt = "" if message.orbit is None else doubt_of_orbit(message.orbit)
         if not doubt and message.unix_s is not None and self._run_unix_s is not None:
             doubt = doubt_of_date(message.unix_s, self._run_unix_s)
         if doubt and not self.doubt:
-            log.warning("truth feed: implausible: %s", doubt)
+            self._doubts += 1
+            if _is_reported(self._doubts):
+                log.warning("truth feed: implausible: %s", doubt)
         self.doubt = doubt
 
     @property
@@ -245,6 +249,11 @@ class LiveTruth:
             return replace(self._held[0].state, status=TruthStatus.BEFORE_START)
         upper = bisect.bisect_right(self._held, t_s, key=lambda held: held.t)
         return _between(self._held[upper - 1], self._held[upper], t_s)
+
+
+def _is_reported(count: int) -> bool:
+    """Return whether what has happened this often is logged: at 1, 10, 100 …, as a peer may repeat it without end."""
+    return str(count).rstrip("0") == "1"
 
 
 def rounded_speed(speed: float) -> float:

@@ -1,22 +1,15 @@
-"""Errors planted in the product's own protocol code, so that device and client share them.
-
-`protocol_mutants.toml` lists them as data: which module or function of `starhil.protocol`, which text in it, and what replaces it.
-"""
+"""Errors planted in the product's own protocol code, so that device and client share them, as `protocol_mutants.toml` lists them."""
 
 from __future__ import annotations
 
-import tomllib
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.planted import Edit, planted
-
-FILE = Path(__file__).with_name("protocol_mutants.toml")
+from tests.planted import PlantedDefect, read_defects
 
 
 @dataclass(frozen=True)
-class ProtocolMutant:
+class ProtocolMutant(PlantedDefect):
     """An error of the product, and the cases of a unit of which at least one must fail.
 
     Attributes
@@ -31,22 +24,10 @@ class ProtocolMutant:
     """
 
     mechanism: str
-    name: str
     unit: str
     cases: tuple[str, ...]
-    edits: tuple[Edit, ...]
     link: str = "serial"
     hidden: bool = True
 
-    def planted(self) -> AbstractContextManager[None]:
-        """Put the error into the running product."""
-        return planted(*self.edits)
 
-
-def read_mutants() -> list[ProtocolMutant]:
-    """Return the mutants of the file."""
-    mutants = []
-    for table in tomllib.loads(FILE.read_text(encoding="utf-8"))["mutant"]:
-        edits, cases = tuple(Edit(**edit) for edit in table.pop("edits")), tuple(table.pop("cases"))
-        mutants.append(ProtocolMutant(**table, cases=cases, edits=edits))
-    return mutants
+MUTANTS = read_defects(Path(__file__).with_name("protocol_mutants.toml"), ProtocolMutant)

@@ -13,26 +13,29 @@ from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.errors import LinkLostError
 from tests.conformance.simulated import SimulatedUnit
 from tests.conformance.test_healthy import SUITES
+from tests.planted import Edit, planted
 from tests.protocol.canopen.conftest import simulated_probe
-from tests.protocol.canopen.mutants import Mutant
 
 pytestmark = pytest.mark.long
 
 UNREADABLE = (
     (
-        Mutant("empty heartbeat", "error-control", "error_control", "bytes([self._context.state]))\n            self._next", 'b"")\n            self._next'),
+        "empty heartbeat",
+        Edit("canopen.error_control", "bytes([self._context.state]))\n            self._next", 'b"")\n            self._next'),
         "canopen.nmt.commands",
         "an answer that can be read",
         "72C# (IndexError",
     ),
     (
-        Mutant("EMCY of 2 bytes", "emcy", "emergency", "MESSAGE.build(fields)", "MESSAGE.build(fields)[:2]"),
+        "EMCY of 2 bytes",
+        Edit("canopen.emergency", "MESSAGE.build(fields)", "MESSAGE.build(fields)[:2]"),
         "canopen.emcy.history-order",
         "bytes of EMCY 8 ",
         "2",
     ),
     (
-        Mutant("SYNC without its counter", "sync", "sync", 'bytes([self._counter]) if overflow else b""', 'b""'),
+        "SYNC without its counter",
+        Edit("canopen.sync", 'bytes([self._counter]) if overflow else b""', 'b""'),
         "canopen.sync.producer",
         "data ['01', '02', '03', '01', '02'] ",
         "['', '', '', '', '']",
@@ -41,12 +44,14 @@ UNREADABLE = (
 
 
 @pytest.mark.parametrize(
-    ("mutant", "caught_by", "expected", "words"), UNREADABLE, ids=lambda item: getattr(item, "name", "")
+    ("edit", "caught_by", "expected", "words"),
+    [each[1:] for each in UNREADABLE],
+    ids=[each[0] for each in UNREADABLE],
 )
 def test_frames_that_cannot_be_parsed_fail_their_cases_and_the_run_continues(
-    mutant, caught_by, expected, words
+    edit, caught_by, expected, words
 ):
-    with mutant.planted():
+    with planted(edit):
         outcomes = run_cases(simulated_probe(), CANOPEN_CASES)
     assert [outcome.id for outcome in outcomes] == [case.id for case in CANOPEN_CASES]
     caught = next(outcome for outcome in outcomes if outcome.id == caught_by)

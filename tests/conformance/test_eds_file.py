@@ -9,6 +9,8 @@ import pytest
 
 from tests.emulator.cli.command_line import run_command_line
 
+pytestmark = pytest.mark.long
+
 
 @pytest.mark.parametrize(
     ("text", "message"),

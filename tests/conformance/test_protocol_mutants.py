@@ -16,14 +16,13 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.unit import load_unit
 from starhil.protocol.unit.examples import examine, exchanges
 from tests.conformance.links import LINKS, write_unit
-from tests.conformance.protocol_mutants import ProtocolMutant, read_mutants
+from tests.conformance.protocol_mutants import MUTANTS, ProtocolMutant
 from tests.conformance.simulated import SimulatedUnit
-from tests.planted import Edit, LostAimError
+from tests.planted import Edit, LostAimError, planted
 from tests.test_your_unit import written
 
 pytestmark = pytest.mark.long
 
-MUTANTS = read_mutants()
 SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
 MECHANISMS = (
     "checks", "framings", "headers", "scalar types", "scaling", "bits", "enumerations", "lengths", "segmentation",
@@ -122,10 +121,12 @@ def test_a_unit_on_any_link_passes_every_case(link: str, order: str, tmp_path: P
         Edit("no_such_module:crc", "a", "b"),
         Edit("serial.checks:crc", "no such text", "b"),
         Edit("serial.checks:crc", "register", "b"),
+        Edit(
+            "serial.checks", "from __future__ import annotations\n", "from __future__ import annotations  \n"
+        ),
     ],
-    ids=["function", "module", "text", "text that occurs several times"],
+    ids=["function", "module", "text", "text that occurs several times", "no effect"],
 )
 def test_a_mutant_whose_aim_is_lost_is_an_error(edit: Edit) -> None:
-    mutant = ProtocolMutant("checks", "lost", "cubestar", (), (edit,))
-    with pytest.raises(LostAimError), mutant.planted():
+    with pytest.raises(LostAimError), planted(edit):
         pass

@@ -11,6 +11,8 @@ from PIL import Image
 
 from starhil.emulator.benchmarks.report_files import as_pdf
 
+pytestmark = pytest.mark.long
+
 HEADING = b"0.0784 0.1569 0.3137 rg"
 
 

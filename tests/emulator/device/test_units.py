@@ -268,6 +268,36 @@ def test_a_plugin_adds_quantities_and_actions(unit, tmp_path):
     assert bench.read("plugged")["t"] == 400
 
 
+@pytest.mark.parametrize("exit_", ["SystemExit(3)", "GeneratorExit", "__import__('asyncio').CancelledError"])
+def test_a_plugin_that_exits_ends_its_answer_and_nothing_else(unit, tmp_path, exit_):
+    """The run ended with status 3, without a word."""
+    (tmp_path / "unit.py").write_text(
+        "from starhil.protocol.plugin import action, quantity\n"
+        '@quantity("odd.value")\n'
+        "def odd(snapshot):\n"
+        '    if snapshot.parameters["exposure"] > 300:\n'
+        f"        raise {exit_}\n"
+        "    return 1\n"
+        '@action("leave")\n'
+        "def leave(device, arguments):\n"
+        '    device.parameters.set({"exposure": 400})\n'
+        f"    raise {exit_}\n",
+        encoding="utf-8",
+    )
+    bench = unit(
+        HEAD
+        + 'plugin = "unit.py"\n'
+        + row("telemetry", 1, "odd", '{ name = "v", type = "u8", value = "odd.value" }')
+        + row("telemetry", 3, "other", '{ name = "up", type = "u32", unit = "s", value = "uptime" }')
+        + row("telecommand", 2, "leave", more='action = "leave"')
+    )
+    assert bench.read("odd")["v"] == 1
+    assert bench.command("leave") is ErrorCode.INTERNAL
+    (reply,) = bench.requests.handle(bench.icd.request(bench.icd.telemetry["odd"]))
+    assert reply.code is ErrorCode.INTERNAL
+    assert bench.read("other")["up"] >= 0
+
+
 def test_a_unit_whose_rows_are_bound_to_nothing_does_not_start(tmp_path):
     text = HEAD + row("telemetry", 1, "bare", '{ name = "a", type = "u8" }') + START
     (tmp_path / "unit.toml").write_text(text, encoding="utf-8")

@@ -84,6 +84,21 @@ def test_a_feed_that_becomes_right_is_no_longer_flagged(caplog):
     assert live.state(1.0).status is TruthStatus.OK
 
 
+def test_a_feed_that_is_right_and_wrong_in_turn_does_not_fill_the_log(caplog):
+    live = LiveTruth(Attitude.identity())
+    live.set_run(1.0, RUN)
+    for k in range(200):
+        position = [7.2e3, 0.0, 0.0] if k % 2 else POSITION_M
+        message = {
+            "t": 0.1 * k,
+            "q": [0.0, 0.0, 0.0, 1.0],
+            "position_m": position,
+            "velocity_m_s": VELOCITY_M_S,
+        }
+        assert live.receive(json.dumps(message), 0.1 * k)
+    assert len(caplog.records) == len(("1", "10", "100"))
+
+
 @pytest.mark.parametrize(
     ("position", "velocity"),
     [

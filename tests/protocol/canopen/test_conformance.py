@@ -6,8 +6,8 @@ import pytest
 
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.runner import run_case
-from tests.planted import LostAimError
-from tests.protocol.canopen.mutants import MUTANTS, Mutant
+from tests.planted import Edit, LostAimError, planted
+from tests.protocol.canopen.mutants import MUTANTS
 
 pytestmark = pytest.mark.long
 
@@ -82,6 +82,6 @@ def test_there_are_enough_mutants():
 def test_mutant_that_no_longer_applies_is_an_error():
     with (
         pytest.raises(LostAimError, match="0 times"),
-        Mutant("x", "sdo", "sdo", "no such text", "").planted(),
+        planted(Edit("canopen.sdo", "no such text", "")),
     ):
         pass

@@ -12,15 +12,17 @@ from starid.identification.options import ALGORITHMS
 from starid.kernels import compile_progress
 from starid.kernels.compile_progress import CompileProgress, kernels_of
 
+pytestmark = pytest.mark.long
+
 PIPELINE = "starhil.emulator.sensor.pipeline.pipeline"
 LOADED = """
 import importlib, inspect, sys
-from numba.core.registry import CPUDispatcher
+from numba.extending import is_jitted
 for name in sys.argv[1:]:
     importlib.import_module(name)
 for module in [*sys.modules.values()]:
     for item in [*vars(module).values()]:
-        if isinstance(item, CPUDispatcher) and inspect.getsource(item.py_func).startswith("@compiled"):
+        if is_jitted(item) and inspect.getsource(item.py_func).startswith("@compiled"):
             print(item.py_func.__module__.rpartition(".")[2] + "." + item.py_func.__name__)
 """
 
