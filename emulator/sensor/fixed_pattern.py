@@ -18,12 +18,14 @@ _HOT_LOG_SPREAD: Final = 1.0
 _DAMAGE_E_S: Final = 4400.0
 _DAMAGE_UM3_TEV_G: Final = 31_150.0
 """Mean dark current of a displacement cascade in silicon at 22 °C, electrons/s, exponentially distributed, and volume times
-dose in which there is one, as commonly quoted from Belloir et al. 2016 (Optics Express 24, 4299); not checked against its text."""
+dose in which there is one: assumed. The numbers are quoted as those of Belloir et al. 2016 (Optics Express 24, 4299), whose text was
+not found."""
 
 _TELEGRAPH_E_S: Final = 1200.0
 _TELEGRAPH_PER_UM3_TEV_G: Final = 3.5e-5
 """Mean amplitude of the random telegraph signals of dark current at 22 °C, electrons/s, exponentially distributed, and their
-number, as commonly quoted from Virmontois et al. 2011 (IEEE TNS 58, 3085: 35 per cm³ and MeV/g); not checked against its text."""
+number: assumed. The numbers are quoted as those of Virmontois et al. 2011 (IEEE TNS 58, 3085: 35 per cm³ and MeV/g), whose text was
+not found."""
 
 _LONGEST_DWELL: Final = 1000.0
 """Mean number of frames for which the slowest signals stay; the fastest change with every frame."""

@@ -24,6 +24,10 @@ WIDEST_BLOCK_PX: Final = 64
 MIN_NOISE_DN: Final = 1.0 / math.sqrt(12.0)
 """Standard deviation of rounding to whole counts."""
 
+_SILENT: Final = 1.001
+_MIXED: Final = 1.5
+"""Noise, in typical ones, from which a block beside a black one is a mixture of it and the sky."""
+
 _ROW_STEP: Final = 4
 _FIRST_SAMPLES: Final = 16
 _CLIP_SIGMA: Final = 3.5
@@ -46,7 +50,9 @@ class Background:
     ----------
     level, noise : ndarray (rows, columns), float32
         Value at the centre of a block, and standard deviation about the plane through its pixels, both without
-        stars; counts.
+        stars; counts. Blocks that a dark body covers have the typical noise, and those at its edge the level of
+        the sky beside: between the centres of these blocks and those beside, where stars are seen, the sky is
+        neither quieter nor steep.
     block_px : float
         Side of a block; the centre of block (i, j) lies at ((j + ½)·block − ½, (i + ½)·block − ½).
     """
@@ -62,9 +68,8 @@ class Background:
 
     @cached_property
     def median_noise(self) -> float:
-        """Typical noise of a pixel, counts, where light reaches the image: blocks without any noise are left out."""
-        lit = self.noise[self.noise > np.float32(1.001 * MIN_NOISE_DN)]
-        return median(lit if lit.size else self.noise)
+        """Typical noise of a pixel, counts, where light reaches the image."""
+        return median(self.noise)
 
 
 @compiled_ieee
@@ -186,7 +191,37 @@ def estimate_background(image: GreyImage, block_px: int = BLOCK_PX) -> Backgroun
     level = np.empty((rows, columns), dtype=np.float32)
     noise = np.empty((rows, columns), dtype=np.float32)
     _block_statistics(image, block_px, level, noise)
+    _replace_dark(level, noise)
     return Background(level, noise, block_px)
+
+
+def _replace_dark(level: Array32, noise: Array32) -> None:
+    """Replace blocks that a body without any light and noise covers, all or in part, in place."""
+    silent = noise <= np.float32(_SILENT * MIN_NOISE_DN)
+    if silent.all() or not silent.any():
+        return
+    sky, typical = median(level[~silent]), np.float32(median(noise[~silent]))
+    noise[silent] = typical
+    black = silent & (level < sky)
+    mixed = (
+        (level < sky) & (noise > np.float32(_MIXED) * typical) & (_sums_of_nine(black.astype(np.float32)) > 0)
+    )
+    dark = black | mixed
+    noise[dark] = typical
+    total = _sums_of_nine(np.where(dark, np.float32(0.0), level))
+    count = _sums_of_nine(np.where(dark, np.float32(0.0), np.float32(1.0)))
+    beside = dark & (count > 0)
+    level[beside] = total[beside] / count[beside]
+
+
+def _sums_of_nine(values: Array32) -> Array32:
+    """Sums (rows, columns) of each value of a grid and its eight neighbours."""
+    rows, columns = values.shape
+    padded, total = np.pad(values, 1), np.zeros_like(values)
+    for row in range(3):
+        for column in range(3):
+            total += padded[row : row + rows, column : column + columns]
+    return total
 
 
 @compiled_ieee

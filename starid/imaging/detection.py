@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, TypeAlias
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices32, Mask, Records
-from starid.arithmetic.elementary import square
+from starid.arithmetic.elementary import log, square
 from starid.errors import StaridError
 from starid.imaging.background import Background, estimate_background
 from starid.imaging.centroid import (
@@ -42,15 +43,17 @@ from starid.imaging.measurement import (
 )
 from starid.imaging.pairs import doubt_close_pairs, split_pairs
 from starid.imaging.spot_shape import (
+    MIN_LONG,
     MOMENT_COLUMNS,
     SpotShape,
+    long_trails,
     moments_of,
     shape_from_moments,
     trails_among_round,
 )
 from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
-from starid.imaging.trail_flow import trail_shifts
+from starid.imaging.trail_flow import FLOW_TERMS, trail_shifts
 from starid.imaging.unmodelled_light import shift_by_edge, trail_variances
 from starid.imaging.windows import (
     DUPLICATE,
@@ -73,9 +76,15 @@ _STARS_FOR_SHAPE: Final = 30
 _PEAKS_FOR_TRAILS: Final = 300
 _MISFITS_FOR_TRAILS: Final = 8
 _MISFIT_SHARE: Final = 0.1
+_EVEN_NOISE: Final = 1.5
+_FEW_TRAILS: Final = 2
+_LOG_CHANCE: Final = 6.9
+"""Minus the log of the probability that noise makes trails of round stars: 0.1 %."""
+
 _SHAPE_WINDOW_PX: Final = 40
 _STARS_FOR_WIDTH: Final = 15
 _MIN_FOR_WIDTH: Final = 3
+_MIN_SCREENED: Final = 1
 _TRAIL_FILTER_PX: Final = 1.5
 _OTHER_WIDTH: Final = 0.3
 _MISFIT_SIGMA: Final = 3.0
@@ -264,6 +273,13 @@ class _Fits:
             self.flags,
         )
 
+    def explained(self, objects: Table, reach_px: float) -> float:
+        """Sum of ``(flux/σ)²`` of the stars near objects, whose first columns are their positions, less two for each parameter of a fit."""
+        good = self.stars[self.stars["state"] == GOOD]
+        off = np.column_stack([good["x"], good["y"]])[:, None] - objects[None, :, :2]
+        near = np.any(np.sum(square(off), axis=2) <= square(reach_px), axis=1)
+        return float(np.sum(square(good["flux"][near]) / good["var_flux"][near] - 2.0 * FIT_PARAMETERS))
+
     @property
     def suspicious(self) -> bool:
         """Whether many candidates do not have the shape of a star."""
@@ -304,15 +320,14 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
     sigma = options.psf_sigma_px if options.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
     scene = _Scene(counts, background, options, float(saturation))
     peaks, heights = _peaks(scene, sigma)
-    shape = _estimate_shape(scene, peaks)
+    shape = _shape_of_stars(scene, peaks, heights)
     if options.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
         peaks, heights = _peaks(scene, shape.sigma_px)
-        shape = _estimate_shape(scene, peaks, shape.sigma_px)
+        shape = _shape_of_stars(scene, peaks, heights, shape.sigma_px)
+    turning = shape if shape.trail_px > 0.0 and shape.stars < _STARS_FOR_SHAPE else None
+    if turning is not None:
+        shape = _shape_of_stars(_at_rest(scene), peaks, heights, shape.sigma_px)
     peaks, heights, hot = _without_hot_pixels(scene, peaks, heights, shape.sigma_px)
-    unsure = options.follow_trails and shape.trail_px == 0.0
-    if unsure and len(hot) > len(peaks):
-        shape = _trails_among_round(scene, peaks, shape)
-        unsure = False
     if shape.trail_px > _TRAIL_FILTER_PX:
         peaks, heights = _trail_peaks(scene, shape, hot)
     if len(peaks) + len(hot) == 0:
@@ -321,10 +336,8 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
             background, "image is flat: no light reaches it" if flat else "no star stands out of the noise"
         )
     fits = _fit_candidates(_without_weight(scene, hot), peaks, heights, shape)
-    if unsure and fits.suspicious:
-        shape = _trails_among_round(scene, peaks[: len(fits.stars)][fits.stars["state"] != FAINT], shape)
-        if shape.trail_px > 0.0:
-            fits = _fit_candidates(_without_weight(scene, hot), *_trail_peaks(scene, shape, hot), shape)
+    if options.follow_trails and shape.trail_px == 0.0:
+        fits, shape = _trails_or_spots(scene, (peaks, heights, hot), fits, shape, turning)
     return _stars_of(scene, fits, shape, len(hot))
 
 
@@ -377,10 +390,16 @@ def _without_hot_pixels(
     """Drop hot pixels: return candidates, heights, and (n, 3) the hot pixels with the sky under them."""
     if sigma_px < MIN_SPREAD_PX:
         return peaks, heights, np.zeros((0, 3))
-    sky = np.empty(len(peaks))
-    sky_under_lone_pixels(scene.counts, peaks, *scene.grids, sky)
+    sky = _sky_under_lone_pixels(scene, peaks)
     hot = ~np.isnan(sky)
     return peaks[~hot], heights[~hot], np.column_stack([peaks[hot], sky[hot]])
+
+
+def _sky_under_lone_pixels(scene: _Scene, peaks: Indices32) -> Array:
+    """Background (n,) under peaks of one pixel, NaN for the others."""
+    sky = np.empty(len(peaks))
+    sky_under_lone_pixels(scene.counts, peaks, *scene.grids, sky)
+    return sky
 
 
 def _without_weight(scene: _Scene, hot: Table) -> _Scene:
@@ -424,15 +443,59 @@ def _search(
             break
         factor *= _THRESHOLD_STEP
     peaks, heights = peaks[:count], heights[:count]
-    rows, columns = background.level.shape
-    blocks = peaks // background.block_px
-    heights -= background.level[np.minimum(blocks[:, 1], rows - 1), np.minimum(blocks[:, 0], columns - 1)]
+    heights -= _level_of_block(background, peaks)
     order = np.argsort(-heights, kind="stable")
     return peaks[order], heights[order]
 
 
-def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float = _ASSUMED_SIGMA_PX) -> SpotShape:
-    """Estimate spot and trails from the brightest unsaturated stars."""
+def _shape_of_stars(
+    scene: _Scene, peaks: Indices32, heights: Grid, assumed: float = _ASSUMED_SIGMA_PX
+) -> SpotShape:
+    """Estimate spot and trails from peaks of several pixels that stand out of an even sky.
+
+    Others may be hot pixels and edges of bodies: in an image with few stars they would be most of the objects, and the spot would
+    seem too narrow. Without such peaks, all count.
+    """
+    several = np.isnan(_sky_under_lone_pixels(scene, peaks))
+    some = several & _stand_out(scene, peaks, heights, assumed)
+    for least, kept in ((_MIN_SCREENED, some), (_MIN_FOR_WIDTH, several)):
+        if np.count_nonzero(kept) >= least:
+            shape = _estimate_shape(scene, peaks[kept], assumed, least)
+            if shape.stars > 0:
+                return shape
+    return _estimate_shape(scene, peaks, assumed, _MIN_FOR_WIDTH)
+
+
+def _at_rest(scene: _Scene) -> _Scene:
+    """Return the scene, without a search for trails."""
+    return dataclasses.replace(scene, settings=dataclasses.replace(scene.settings, follow_trails=False))
+
+
+def _stand_out(scene: _Scene, peaks: Indices32, heights: Grid, sigma_px: float) -> Mask:
+    """Which peaks (n,) are above the threshold over the sky in a ring around them, if it is even."""
+    background = scene.background
+    windows = np.zeros(len(peaks), WINDOW)
+    spot = (sigma_px, scene.saturation, background.median_noise)
+    factor = noise_factor(spot_taps(sigma_px))
+    flux = heights / np.float32(square(factor))
+    lay_windows(scene.counts, peaks, flux, *scene.grids, spot, np.zeros(FLOW_TERMS), windows)
+    above = heights + _level_of_block(background, peaks) - windows["base"]
+    even = windows["noise"] <= _EVEN_NOISE * background.median_noise
+    threshold = scene.settings.threshold_sigma * factor * windows["noise"]
+    return np.asarray(even & (above >= threshold), dtype=np.bool_)
+
+
+def _level_of_block(background: Background, peaks: Indices32) -> Grid:
+    """Level (n,) of the blocks in which peaks lie."""
+    rows, columns = background.level.shape
+    blocks = peaks // background.block_px
+    return np.asarray(
+        background.level[np.minimum(blocks[:, 1], rows - 1), np.minimum(blocks[:, 0], columns - 1)]
+    )
+
+
+def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float, least: int) -> SpotShape:
+    """Estimate spot and trails from the brightest unsaturated stars, the spot from at least `least`."""
     settings = scene.settings
     height, width = scene.counts.shape
     start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
@@ -446,23 +509,70 @@ def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float = _ASSUMED_S
         shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
         if shape.trail_px == 0.0 or count < star_count:
             break
+    if not settings.follow_trails:
+        shape = dataclasses.replace(shape, flow=np.zeros_like(shape.flow), trail_px=0.0)
     if settings.psf_sigma_px is None and shape.trail_px == 0.0:
         widths = np.empty(_STARS_FOR_WIDTH)
         fitted = spot_widths(scene.counts, tries, *scene.grids, start, scene.saturation, widths)
-        if fitted >= _MIN_FOR_WIDTH:
+        if fitted >= least:
             shape = dataclasses.replace(shape, sigma_px=float(np.median(widths[:fitted])), stars=fitted)
-    if settings.follow_trails:
-        return shape
-    return dataclasses.replace(shape, flow=np.zeros_like(shape.flow), trail_px=0.0)
+    return shape
 
 
-def _trails_among_round(scene: _Scene, peaks: Indices32, shape: SpotShape) -> SpotShape:
-    """Check for trails although the brightest objects are round."""
-    tries = peaks[:_PEAKS_FOR_TRAILS]
-    table = np.empty((len(tries), MOMENT_COLUMNS))
+def _moments(scene: _Scene, peaks: Indices32, shape: SpotShape) -> Table:
+    """Return the moments (n, 5) of the measurable peaks."""
+    table = np.empty((len(peaks), MOMENT_COLUMNS))
     limits = (_SHAPE_WINDOW_PX, scene.saturation)
-    count = moments_of(scene.counts, tries, *scene.level, shape.sigma_px, *limits, table)
-    return trails_among_round(table[:count], scene.counts.shape[1], scene.counts.shape[0], shape)
+    return table[: moments_of(scene.counts, peaks, *scene.level, shape.sigma_px, *limits, table)]
+
+
+def _trails_or_spots(
+    scene: _Scene,
+    found: tuple[Indices32, Grid, Table],
+    fits: _Fits,
+    shape: SpotShape,
+    turning: SpotShape | None,
+) -> tuple[_Fits, SpotShape]:
+    """Follow trails that too few of the brightest objects show to exclude chance, if trails explain the light better than round spots.
+
+    Each fit lowers the sum of squares of its pixels by ``(flux/σ)²``, so that the difference of both models' sums is twice the
+    logarithm of the ratio of their likelihoods; as one trail may look like several spots, it is compared by Akaike's criterion.
+
+    Parameters
+    ----------
+    found : (peaks, heights, hot pixels)
+        From `_without_hot_pixels`.
+    turning : SpotShape or None
+        The shape by the brightest stars, if that has trails.
+    """
+    peaks, heights, hot = found
+    height, width = scene.counts.shape
+    most_are_hot = len(hot) > len(peaks)
+    tries = _stand_out(scene, peaks, heights, shape.sigma_px)
+    if not most_are_hot:
+        tries[: len(fits.stars)] &= fits.stars["state"] != FAINT
+    count = _PEAKS_FOR_TRAILS if most_are_hot or fits.suspicious else _STARS_FOR_SHAPE
+    table = _moments(scene, peaks[tries][:count], shape)
+    longest = table[long_trails(table, shape.sigma_px)]
+    if turning is None:
+        least = _FEW_TRAILS if 2 * len(longest) >= len(table) else MIN_LONG
+        turning = trails_among_round(longest, width, height, shape, least)
+    if turning.trail_px == 0.0 or len(longest) == 0:
+        return fits, shape
+    trails = _fit_candidates(_without_weight(scene, hot), *_trail_peaks(scene, turning, hot), turning)
+    reach = turning.trail_px
+    more = trails.explained(longest, reach) - fits.explained(longest, reach)
+    return (trails, turning) if more > _more_by_chance(len(table), len(longest)) else (fits, shape)
+
+
+def _more_by_chance(objects: int, longest: int) -> float:
+    """How much more light, as in `_Fits.explained`, the trails of the longest of some round objects explain by chance at most.
+
+    The flow is fitted to noise: χ² with as many degrees of freedom as it has terms, whose tail is at most
+    ``P(χ² ≥ k + 2 √(k x) + 2 x) ≤ exp(−x)`` (Laurent & Massart 2000, lemma 1), in the best of all choices of so many objects.
+    """
+    x = _LOG_CHANCE + log(math.comb(objects, longest))
+    return FLOW_TERMS + 2.0 * math.sqrt(FLOW_TERMS * x) + 2.0 * x
 
 
 def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotShape) -> _Fits:

@@ -20,6 +20,9 @@ from starid.imaging.normal_table import gaussian
 from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, lengths_and_mismatches
 from starid.kernels.jit import compiled_ieee
 
+MIN_LONG: Final = 6
+"""Least number of elongated objects that agree on a flow, among others that are round."""
+
 MOMENT_COLUMNS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
 _ITERATIONS: Final = 30
@@ -32,7 +35,6 @@ _LEAST_SPLIT: Final = 1e-300
 _SERIES_END: Final = 101
 _MISMATCH_SHARE: Final = 0.4
 _LONG_PX: Final = 2.5
-_MIN_LONG: Final = 6
 _AGREEMENT_SHARE: Final = 0.3
 _AGREEING_SHARE: Final = 0.5
 
@@ -230,7 +232,7 @@ def long_trails(table: Array, sigma_px: float) -> Mask:
     return np.asarray(trail_length(mean + split, square(sigma_px) + _PIXEL_VARIANCE) > _LONG_PX, dtype=bool)
 
 
-def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) -> SpotShape:
+def trails_among_round(table: Array, width: int, height: int, shape: SpotShape, least: int) -> SpotShape:
     """Find trails where most objects are round and not stars: particles, hot pixels, reflections.
 
     Parameters
@@ -241,18 +243,18 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
         Size of the image.
     shape : SpotShape
         Shape of the round objects; returned unchanged unless enough elongated ones agree on a flow.
+    least : int
+        Least number of those that agree.
     """
     longest = table[long_trails(table, shape.sigma_px)]
-    if len(longest) < _MIN_LONG:
+    if len(longest) < least:
         return shape
     trail = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
     positions, trails, length = _trails(longest, width, height, square(shape.sigma_px) + _PIXEL_VARIANCE)
     agree = np.count_nonzero(
         lengths_and_mismatches(trail.flow, positions, trails)[1] < _AGREEMENT_SHARE * length
     )
-    return (
-        trail if trail.trail_px > 0.0 and agree >= max(_MIN_LONG, _AGREEING_SHARE * len(longest)) else shape
-    )
+    return trail if trail.trail_px > 0.0 and agree >= max(least, _AGREEING_SHARE * len(longest)) else shape
 
 
 def _mean_and_split(table: Array) -> tuple[Array, Array]:

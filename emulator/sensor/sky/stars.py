@@ -99,8 +99,8 @@ class SkyStars:
         if not any(errors):
             return self._vectors, self._flux_e_s
         if self._wrong[0] != errors:
-            rng = np.random.default_rng((self._seed, _CATALOG_STREAM))
-            vectors, fainter = _with_errors(self._hip, self._vectors, *errors, rng)
+            drawn = _drawn(self._hip, self._seed)
+            vectors, fainter = _with_errors(self._hip, self._vectors, *errors, drawn)
             self._wrong = errors, vectors, flux_ratio(fainter)
         return self._wrong[1], self._flux_e_s * self._wrong[2]
 
@@ -119,19 +119,26 @@ def displaced(vectors: Array, east_arcsec: Array, north_arcsec: Array) -> Array:
     return np.asarray(ahead[:, None] * vectors + share[:, None] * offset)
 
 
+def _drawn(hip: Indices32, seed: int) -> Array:
+    """Normal numbers (n, 3) of stars, which depend on their own HIP numbers alone: another star changes nothing for the others."""
+    return np.array(
+        [np.random.default_rng((seed, _CATALOG_STREAM, each)).normal(size=3) for each in hip.tolist()]
+    )
+
+
 def _with_errors(
     hip: Indices32,
     vectors: Array,
     position_error_arcsec: float,
     magnitude_error: float,
     single: Sequence[CatalogError],
-    rng: np.random.Generator,
+    drawn: Array,
 ) -> tuple[Array, Array]:
     """Return where the sky shows stars (n, 3), and how much fainter (n,), magnitudes.
 
-    `hip` (n,) and `vectors` (n, 3) are those of the catalogue, the errors standard deviations along each axis.
+    `hip` (n,) and `vectors` (n, 3) are those of the catalogue, the errors standard deviations along each axis, by which the normal
+    numbers in `drawn` (n, 3) are multiplied.
     """
-    drawn = rng.normal(size=(len(hip), 3))
     east, north = position_error_arcsec * drawn[:, :2].T
     fainter = magnitude_error * drawn[:, 2]
     for star in single:

@@ -9,7 +9,7 @@ import pytest
 
 from starhil.emulator.sensor.renderer import Renderer
 from starhil.emulator.sensor.sky.objects import CatalogError, SkyObjects
-from starhil.emulator.sensor.sky.stars import displaced
+from starhil.emulator.sensor.sky.stars import _drawn, _with_errors, displaced
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
@@ -66,6 +66,18 @@ def test_errors_of_the_catalogue_have_the_stated_spread_and_stay_the_same(render
     assert max(np.linalg.norm(off[0][hip] - off[1][hip]) for hip in both) < 0.01
     squares = [float(vector @ vector) / 2.0 for vector in off[0].values()]
     assert math.sqrt(np.mean(squares)) == pytest.approx(20.0, rel=4.0 * 0.5 / math.sqrt(len(squares)))
+
+
+def test_another_star_does_not_change_the_errors_of_the_others() -> None:
+    """So a recording replays after a variable star was added to those that come within the limit at their maximum."""
+    hip = np.array([7, 27989, 100_000], dtype=np.int32)
+    vectors = np.eye(3)
+    drawn = _drawn(hip, seed=3)
+    assert np.array_equal(_drawn(np.insert(hip, 1, 97_649), seed=3)[[0, 2, 3]], drawn)
+    assert not np.array_equal(_drawn(hip, seed=4), drawn)
+    shown, fainter = _with_errors(hip, vectors, 20.0, 0.3, (), drawn)
+    assert np.all(np.linalg.norm(shown - vectors, axis=1) > 0.0)
+    assert fainter == pytest.approx(0.3 * drawn[:, 2])
 
 
 def test_the_attitude_is_off_by_the_mean_of_its_stars_errors() -> None:
