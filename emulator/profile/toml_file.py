@@ -16,7 +16,7 @@ def find_toml(kind: Kind, name_or_path: str, relative_to: Path = Path()) -> Path
     failed = f"{kind} {name_or_path!r}: cannot be read"  # RuntimeError: the home folder of an unknown user
     with explained(failed, "give another path", errors=(OSError, RuntimeError)):
         path = relative_to / find(kind, name_or_path)
-        with suppress(FileNotFoundError, NotADirectoryError):
+        with suppress(FileNotFoundError, NotADirectoryError, ValueError):  # a null byte is in no path
             path.stat()  # Path.exists is silent about other errors from Python 3.14 on
             if name_or_path:  # an empty name is the working folder as a path
                 return path
