@@ -22,12 +22,14 @@ GUARDED = {
     ("storage/cache.py", "grp"),
     ("storage/cache.py", "pwd"),
     ("storage/cache.py", "geteuid"),
+    ("storage/files.py", "geteuid"),
     ("storage/temporary_folder.py", "fcntl"),
     ("storage/temporary_folder.py", "O_DIRECTORY"),
     ("storage/temporary_folder.py", "O_NOFOLLOW"),
     ("storage/temporary_folder.py", "geteuid"),
+    ("storage/working_folder.py", "geteuid"),
 }
-"""Uses after a test of `sys.platform`: owners of a folder, and locks."""
+"""Uses after a test of `sys.platform`: owners of folders and files, and locks."""
 
 
 def names(tree: ast.AST) -> Iterator[str]:
