@@ -124,6 +124,7 @@ def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
     fresh = {key: value for key, value in vars(module).items() if key.startswith("__")}
     exec(compiled, fresh)
     undo, changes = ExitStack(), 0
+    gc.unfreeze()  # `starhil run`, in this process, hides its objects from the collector
     for function in [item for item in gc.get_objects() if type(item) is types.FunctionType]:
         code = function.__code__
         ours = function.__globals__ is vars(module) and code.co_filename == file  # not made by a decorator
