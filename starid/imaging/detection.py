@@ -73,6 +73,7 @@ _MAX_PEAKS: Final = 8192
 _THRESHOLD_STEP: Final = 1.5
 _STARS_FOR_A_GLANCE: Final = 12
 _STARS_FOR_SHAPE: Final = 30
+_PEAKS_FOR_SHAPE: Final = 120
 _PEAKS_FOR_TRAILS: Final = 300
 _MISFITS_FOR_TRAILS: Final = 8
 _MISFIT_SHARE: Final = 0.1
@@ -457,10 +458,10 @@ def _shape_of_stars(
     seem too narrow. Without such peaks, all count.
     """
     several = np.isnan(_sky_under_lone_pixels(scene, peaks))
-    some = several & _stand_out(scene, peaks, heights, assumed)
-    for least, kept in ((_MIN_SCREENED, some), (_MIN_FOR_WIDTH, several)):
-        if np.count_nonzero(kept) >= least:
-            shape = _estimate_shape(scene, peaks[kept], assumed, least)
+    some = _that_stand_out(scene, peaks, heights, several, _PEAKS_FOR_SHAPE, assumed)
+    for least, kept in ((_MIN_SCREENED, some), (_MIN_FOR_WIDTH, peaks[several])):
+        if len(kept) >= least:
+            shape = _estimate_shape(scene, kept, assumed, least)
             if shape.stars > 0:
                 return shape
     return _estimate_shape(scene, peaks, assumed, _MIN_FOR_WIDTH)
@@ -469,6 +470,19 @@ def _shape_of_stars(
 def _at_rest(scene: _Scene) -> _Scene:
     """Return the scene, without a search for trails."""
     return dataclasses.replace(scene, settings=dataclasses.replace(scene.settings, follow_trails=False))
+
+
+def _that_stand_out(
+    scene: _Scene, peaks: Indices32, heights: Grid, among: Mask, most: int, sigma_px: float
+) -> Indices32:
+    """Return the brightest peaks among some that stand out, `most` of them; only as many are examined as it takes."""
+    tried = most
+    while True:
+        tried += most // 4
+        stand_out = among[:tried] & _stand_out(scene, peaks[:tried], heights[:tried], sigma_px)
+        if tried >= len(peaks) or np.count_nonzero(stand_out) >= most:
+            return peaks[:tried][stand_out][:most]
+        tried *= 2
 
 
 def _stand_out(scene: _Scene, peaks: Indices32, heights: Grid, sigma_px: float) -> Mask:
@@ -499,7 +513,7 @@ def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float, least: int)
     settings = scene.settings
     height, width = scene.counts.shape
     start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
-    tries = peaks[: 4 * _STARS_FOR_SHAPE]
+    tries = peaks[:_PEAKS_FOR_SHAPE]
     # a few stars show whether there are trails at all; more are needed only to follow them
     for star_count in (_STARS_FOR_A_GLANCE, _STARS_FOR_SHAPE):
         table = np.empty((star_count, MOMENT_COLUMNS))
@@ -548,11 +562,11 @@ def _trails_or_spots(
     peaks, heights, hot = found
     height, width = scene.counts.shape
     most_are_hot = len(hot) > len(peaks)
-    tries = _stand_out(scene, peaks, heights, shape.sigma_px)
+    bright = np.ones(len(peaks), dtype=np.bool_)
     if not most_are_hot:
-        tries[: len(fits.stars)] &= fits.stars["state"] != FAINT
+        bright[: len(fits.stars)] = fits.stars["state"] != FAINT
     count = _PEAKS_FOR_TRAILS if most_are_hot or fits.suspicious else _STARS_FOR_SHAPE
-    table = _moments(scene, peaks[tries][:count], shape)
+    table = _moments(scene, _that_stand_out(scene, peaks, heights, bright, count, shape.sigma_px), shape)
     longest = table[long_trails(table, shape.sigma_px)]
     if turning is None:
         least = _FEW_TRAILS if 2 * len(longest) >= len(table) else MIN_LONG
