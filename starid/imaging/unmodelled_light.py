@@ -54,11 +54,15 @@ def shift_by_edge(
         explained += np.maximum(windows["base"] - background.median_level, 0.0) / gain_e_per_dn
     rest = square(windows["noise"]) - explained
     step = _STEP_PER_SPREAD * np.sqrt(np.where(rest > explained, rest, 0.0))
-    ends = windows["offset"] + windows["columns"] * windows["rows"]
-    for k, (begin, end, sky2) in enumerate(zip(windows["offset"], ends, explained, strict=True)):
-        window = pixels[begin:end]
-        darkest = -float(np.partition(window, _DARK_PIXELS - 1)[_DARK_PIXELS - 1])
-        if darkest > _DARK_SIGMA * math.sqrt(sky2):
+    begins = windows["offset"]
+    ends = begins + windows["columns"] * windows["rows"]
+    lowest = np.minimum.reduceat(np.append(pixels, np.float32(0.0)), np.column_stack([begins, ends]).ravel())[
+        ::2
+    ]
+    dark = _DARK_SIGMA * np.sqrt(explained)
+    for k in np.flatnonzero(-lowest > dark):
+        darkest = -float(np.partition(pixels[begins[k] : ends[k]], _DARK_PIXELS - 1)[_DARK_PIXELS - 1])
+        if darkest > dark[k]:
             step[k] = max(step[k], darkest)
     trail2 = square(windows["trail_x"]) + square(windows["trail_y"])
     reach = np.sqrt(trail2 + square(4.0 / math.sqrt(2.0 * math.pi) * sigma_px))
