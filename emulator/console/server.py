@@ -245,7 +245,9 @@ class ConsoleServer:
 
     async def _interface(self, request: web.Request) -> web.Response:
         """Return the interface definition of the unit that runs, in Markdown."""
-        text = await in_thread(export, self._console(request).icd, "markdown")
+        icd = self._console(request).icd
+        async with self._export_turn():
+            text = await in_thread(export, icd, "markdown")
         return web.Response(text=text, content_type="text/plain", charset="utf-8")
 
     async def _wire_log(self, request: web.Request) -> web.Response:
@@ -360,9 +362,21 @@ class ConsoleServer:
                 answer = {"type": "answer", "id": request.get("id"), "ok": False, "error": error}
                 viewer.send(json.dumps(answer))
                 continue
-            task = asyncio.create_task(_answer(console, viewer, request))
+            task = asyncio.create_task(self._answer(console, viewer, request))
             tasks.add(task)
             task.add_done_callback(tasks.discard)
+
+    async def _answer(self, console: Console, viewer: Viewer, request: dict[str, object]) -> None:
+        """Answer a request, once the page has read what it was sent and its earlier requests have begun.
+
+        The answers have turns of all pages too: requests of many pages that wait would else be answered at once.
+        """
+        async with viewer.turn:
+            await asyncio.sleep(PAGE_TURN_S)
+            while viewer.behind:
+                await asyncio.sleep(PAGE_TURN_S)
+            await self._wait_for_turn()
+        viewer.send(json.dumps(await console.answer(viewer, request)))
 
 
 class _ServerLog(logging.LoggerAdapter[logging.Logger]):
@@ -390,15 +404,6 @@ class _Gate(asyncio.Protocol):
             protocol = self._server()
             transport.set_protocol(protocol)
             protocol.connection_made(transport)
-
-
-async def _answer(console: Console, viewer: Viewer, request: dict[str, object]) -> None:
-    """Answer a request, once the page has read what it was sent and its earlier requests have begun."""
-    async with viewer.turn:
-        await asyncio.sleep(PAGE_TURN_S)
-        while viewer.behind:
-            await asyncio.sleep(PAGE_TURN_S)
-    viewer.send(json.dumps(await console.answer(viewer, request)))
 
 
 async def _pump(viewer: Viewer, socket: web.WebSocketResponse) -> None:
