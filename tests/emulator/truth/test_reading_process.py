@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import os
 import signal
@@ -180,7 +181,12 @@ def readers_of(parent: int) -> list[int]:
         for task in Path(f"/proc/{parent}/task").iterdir()
         for child in (task / "children").read_text().split()
     ]
-    return [child for child in children if b"reading_process" in Path(f"/proc/{child}/cmdline").read_bytes()]
+    readers = []
+    for child in children:
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            if b"reading_process" in Path(f"/proc/{child}/cmdline").read_bytes():
+                readers.append(child)
+    return readers
 
 
 @pytest.mark.process
