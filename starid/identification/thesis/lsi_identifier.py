@@ -315,7 +315,7 @@ class LsiIdentifier(VerifiedIdentifier):
     ) -> FeatureAnswer | None:
         """Answer of the whole database at the first zero point for which there are features; None if there is none.
 
-        `wanted` is a mask of the detections from which features are computed; by default all.
+        `true_stars` is a mask of the detections from which features are computed; by default all.
         """
         for zero_point, field in fields:
             features = self.search.features(field if true_stars is None else field.only(true_stars))
