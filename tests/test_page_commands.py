@@ -206,7 +206,8 @@ class Shell:
         if words[:2] == ["starhil", "run"]:
             self.end()
             command = [installed_command(), *words[1:], *NO_IMAGES]
-            self.ready = self._emulators.enter_context(EmulatorProcess(command)).ready
+            self._process = self._emulators.enter_context(EmulatorProcess(command))
+            self.ready = self._process.ready
             return ""
         if words[0] in APPS:
             status, out, stderr = run_command_line(*words[1:], program=words[0])
@@ -227,6 +228,11 @@ class Shell:
     def end(self) -> None:
         """End the emulator, as Ctrl-C does."""
         self._emulators.close()
+
+    def ended(self) -> None:
+        """Wait for the end of an emulator that has been told to quit."""
+        assert self._process.process.wait(timeout=PATIENCE_S) == 0
+        self._process.kill()
 
 
 @pytest.fixture
@@ -307,7 +313,7 @@ def test_the_attitudes_of_a_file_are_run_and_converted(shell):
     ((program, printed),) = programs("truth-files.md")
     text = program.text.replace("/tmp/starhil-control", shell.ready["control"].removeprefix("unix:"))
     assert run(replace(program, text=text), {}) == printed
-    shell.end()
+    shell.ended()
     for line in lines_of("docs/truth-files.md", "starhil truth convert"):
         if "-44007" not in line or find_spec("spiceypy") is not None:
             shell.type(line)

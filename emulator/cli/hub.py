@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 from pathlib import Path
 from typing import Annotated
 
@@ -25,6 +24,7 @@ def command(
     """
     import asyncio
 
+    from starhil.emulator.cli.termination import ended_by_signals
     from starhil.emulator.simulation.guard import log_loop_errors_once
     from starhil.protocol.transports.hub import DEFAULT_BUS, CanHub
 
@@ -35,13 +35,11 @@ def command(
         hub = CanHub(host, port, log=log)
         await hub.start()
         ended = asyncio.Event()
-        loop = asyncio.get_running_loop()
-        log_loop_errors_once(loop)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, ended.set)
-        print(f"ready can=socketcand:{hub.host}:{hub.port}/{DEFAULT_BUS}", flush=True)
-        await ended.wait()
-        await hub.close()
+        log_loop_errors_once(asyncio.get_running_loop())
+        with ended_by_signals(ended.set):
+            print(f"ready can=socketcand:{hub.host}:{hub.port}/{DEFAULT_BUS}", flush=True)
+            await ended.wait()
+            await hub.close()
         counters = hub.statistics
         print(
             f"frames={counters.frames} delivered={counters.delivered} dropped={counters.dropped} "

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import importlib
 import logging
-import signal
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +26,7 @@ from starhil.emulator.cli.options import (
     with_orbit,
 )
 from starhil.emulator.cli.output import report_slow_start
+from starhil.emulator.cli.termination import ended_by_signals
 from starhil.emulator.console.recorders import RECORDERS
 from starhil.emulator.errors import EmulatorError
 from starid.cli.output import output_help, prepare_output
@@ -331,29 +331,24 @@ async def _serve(make: Callable[[], Emulator], algorithms: Collection[str]) -> i
 
     share_interpreter()
     emulator = make()
-    loop = asyncio.get_running_loop()
-    log_loop_errors_once(loop)
-    ends = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # ignored under nohup
-        ends.append(signal.SIGHUP)
-    for number in ends:
-        loop.add_signal_handler(number, emulator.ended.set)
-    try:
-        line = asyncio.create_task(_started(emulator))
-        stop = asyncio.create_task(emulator.ended.wait())
-        progress = asyncio.create_task(report_slow_start(algorithms))
-        await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
-        progress.cancel()
-        if line.done():
-            gc.collect()
-            gc.freeze()  # long-lived objects: garbage collection would pause the links
-            print(line.result(), flush=True)
-            await stop
-        else:
-            line.cancel()
-            await asyncio.wait({line})
-    finally:
-        await emulator.close()
+    log_loop_errors_once(asyncio.get_running_loop())
+    with ended_by_signals(emulator.ended.set):
+        try:
+            line = asyncio.create_task(_started(emulator))
+            stop = asyncio.create_task(emulator.ended.wait())
+            progress = asyncio.create_task(report_slow_start(algorithms))
+            await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
+            progress.cancel()
+            if line.done():
+                gc.collect()
+                gc.freeze()  # long-lived objects: garbage collection would pause the links
+                print(line.result(), flush=True)
+                await stop
+            else:
+                line.cancel()
+                await asyncio.wait({line})
+        finally:
+            await emulator.close()
     return int(emulator.failed)
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import io
+import signal
 import sys
 from unittest import mock
 
 import pytest
 
 from starhil.emulator.cli import app as starhil
+from starhil.emulator.cli.termination import ENDING
 from starid.cli import app as starid
 
 
@@ -17,6 +19,7 @@ def run_command_line(
     *arguments: str, encoding: str = "utf-8", program: str = "starhil"
 ) -> tuple[int, str, str]:
     """Run `starhil` or `starid`; return exit status, standard output and standard error."""
+    handlers = {number: signal.getsignal(number) for number in ENDING}
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding, write_through=True) for _ in range(2))
     with (
         mock.patch.object(sys, "argv", [program, *arguments]),
@@ -26,6 +29,8 @@ def run_command_line(
     ):
         {"starhil": starhil, "starid": starid}[program].main()
     assert isinstance(end.value.code, int)
+    for number, handler in handlers.items():  # a process of its own would end here, with signals ignored
+        signal.signal(number, handler)
     return end.value.code, _text(out), _text(err)
 
 

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 import tty
 from pathlib import Path
 
@@ -307,3 +308,17 @@ def check_rejected(arguments, message):
     (line,) = log_lines(err)
     assert line.startswith("starhil: ")
     assert message in line
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_signals_to_an_emulator_that_ends_do_not_change_its_status(number):
+    """Sent until the process is gone: one in its last tenth of a second ended it by the signal."""
+    emulator = Emulator("--clock", "stepped")
+    emulator.do("quit")
+    os.close(emulator.fd)
+    emulator.control.close()
+    deadline = time.monotonic() + PATIENCE_S
+    while emulator.process.poll() is None and time.monotonic() < deadline:
+        emulator.process.send_signal(number)
+        time.sleep(0.001)
+    assert (emulator.process.wait(timeout=1.0), log_lines(emulator.process.stderr.read())) == (0, [])
