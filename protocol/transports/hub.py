@@ -86,8 +86,9 @@ class HubStatistics:
 class FairQueue:
     """Queue of lines for one receiver, in which senders take turns, one line each.
 
-    Lines of one sender stay in order. When the queue is full, the sender with the most waiting bytes loses
-    its oldest lines, as many bytes as are added: a search for each line took most of the time of a flood. `limit` is the maximum number of waiting bytes.
+    Lines of one sender stay in order. When the queue is full, the sender with the most waiting bytes loses its
+    oldest lines, at most some bytes more than are added: to choose it again for each line took most of the time of
+    a flood. `limit` is the maximum number of waiting bytes.
     """
 
     def __init__(self, limit: int) -> None:
