@@ -52,6 +52,10 @@ from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
 
+STRANGER_TURN_S: Final = 0.02
+"""Shortest time between two requests of connections that have not shown the token, seconds: the links of the device are served
+first."""
+
 MAX_LINE: Final = 1 << 16
 """Longest request, bytes."""
 
@@ -96,6 +100,8 @@ class ControlServer:
         self._peers: dict[asyncio.StreamWriter, bool] = {}
         """Connections, the oldest first, and whether one of their requests was accepted."""
         self._limit = ConnectionLimit("control channel", BUSY_ANSWER)
+        self._stranger = asyncio.Lock()
+        """Held by the connection without the token whose request is next."""
         self._actions: dict[str, tuple[Action, tuple[str, ...] | None]] = {
             "status": (self._status, ()),
             "truth": (self._truth, ("run_time_s", "unix_s")),
@@ -151,6 +157,9 @@ class ControlServer:
             detect_lost_peer(writer.transport, must_read=True)
         try:
             async for line in read_lines(reader, MAX_LINE, within_s=REQUEST_S):
+                if self._token and not self._peers.get(writer):
+                    async with self._stranger:
+                        await asyncio.sleep(STRANGER_TURN_S)
                 answer = await self.answer(line)
                 if writer in self._peers:
                     self._peers[writer] |= answer["ok"]

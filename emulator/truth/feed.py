@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import Final, Literal
@@ -75,18 +76,36 @@ class LockStep:
 MAX_LINES: Final = 32
 """Most lines of a datagram."""
 
+MAX_LINES_PER_S: Final = 2000.0
+"""Most lines of datagrams per second, beyond a burst: the links of the device are served too."""
+
+BURST: Final = 200.0
+"""Most lines of datagrams that may come at once."""
+
 
 class _Datagrams(asyncio.DatagramProtocol):
-    """Passes each line of each datagram to the feed."""
+    """Passes each line of each datagram to the feed, unless they come too fast."""
 
-    def __init__(self, feed: LiveFeed) -> None:
+    def __init__(self, feed: LiveFeed, lines_per_s: float = MAX_LINES_PER_S) -> None:
         self._feed = feed
+        self._lines_per_s = lines_per_s
+        self._room = BURST
+        """Number of lines that may come now."""
+        self._counted_s = time.monotonic()
 
     def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002 (asyncio's signature)
+        now_s = time.monotonic()
+        self._room = min(self._room + (now_s - self._counted_s) * self._lines_per_s, BURST)
+        self._counted_s = now_s
         lines = data.split(b"\n", MAX_LINES)
         for line in lines[:MAX_LINES]:
-            if line.strip():
-                self._feed.receive(line)
+            if not line.strip():
+                continue
+            if self._room < 1.0:
+                self._feed.truth.reject(f"more than {self._lines_per_s:g} messages per second")
+                return
+            self._room -= 1.0
+            self._feed.receive(line)
         if any(line.strip() for line in lines[MAX_LINES:]):
             self._feed.truth.reject(f"datagram of more than {MAX_LINES} lines")
 
@@ -113,6 +132,8 @@ class LiveFeed:
         self._client: asyncio.Task[None] | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._limit = ConnectionLimit("truth feed")
+        self._turn = asyncio.Lock()
+        """Held by the connection whose message is next: many do not take the loop together."""
 
     async def start(self, socket: Socket, host: str, port: int) -> str:
         """Listen, or start connecting; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`."""
@@ -192,7 +213,9 @@ class LiveFeed:
                 if data is None:
                     self.truth.reject(self._too_long())
                 else:
-                    await self._answer(data, writer)
+                    async with self._turn:
+                        await self._answer(data, writer)
+                        await asyncio.sleep(0)
         except ConnectionError:
             self.truth.reject("connection broken")
         finally:

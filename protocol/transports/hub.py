@@ -24,6 +24,7 @@ from starhil.protocol.can.frame import CanFrame, format_candump
 from starhil.protocol.can.socketcand import CommandSplitter, format_frame, parse_send
 from starhil.protocol.errors import ProtocolError, reason
 from starhil.protocol.transports.connections import (
+    TURN,
     WINDOW,
     ConnectionLimit,
     TurnProtocol,
@@ -43,6 +44,22 @@ BACKLOG_LIMIT: Final = 256 * 1024
 A kernel CAN socket holds fewer than 300 frames by default. Waiting frames are stale when read, and delay
 later ones.
 """
+
+LEAST_TURN: Final = 256
+"""Number of bytes that is read from a client at a time when many send much."""
+
+FREE_SHARE: Final = 0.02
+"""Share of the loop that a client may take without rests: 200 frames per second."""
+
+FREE_IN_ALL: Final = 0.3
+"""Share of the loop that all clients together may take without rests."""
+
+LEAST_TAKEN_S: Final = 0.001
+"""Processor time beyond the free share after which a client rests, seconds."""
+
+REST: Final = 3.0
+"""Length of a rest: this many times what the client has taken. Clients that rest do so one after another, so that all of them
+together leave three quarters of the loop to the links."""
 
 SETTLE_S: Final = 1.0
 """Longest time that frames are withheld from a client that has just entered raw mode.
@@ -69,8 +86,9 @@ class HubStatistics:
 class FairQueue:
     """Queue of lines for one receiver, in which senders take turns, one line each.
 
-    Lines of one sender stay in order. When the queue is full, the sender with the most waiting bytes loses
-    its oldest line. `limit` is the maximum number of waiting bytes.
+    Lines of one sender stay in order. When the queue is full, the sender with the most waiting bytes loses its
+    oldest lines, at most some bytes more than are added: to choose it again for each line took most of the time of
+    a flood. `limit` is the maximum number of waiting bytes.
     """
 
     def __init__(self, limit: int) -> None:
@@ -91,8 +109,10 @@ class FairQueue:
         dropped = 0
         while self.size > self._limit:
             longest = max(self._sizes, key=lambda each: self._sizes[each])
-            self._note_removed(longest, self._lines[longest].popleft())
-            dropped += 1
+            lines_of_longest, least = self._lines[longest], self._sizes[longest] - added
+            while self.size > self._limit and lines_of_longest and self._sizes[longest] >= least:
+                self._note_removed(longest, lines_of_longest.popleft())
+                dropped += 1
         return dropped
 
     def take(self, size: int) -> list[bytes]:
@@ -123,6 +143,11 @@ class _Client(TurnProtocol):
         self._waiting = FairQueue(BACKLOG_LIMIT)
         self._full = False
         self._settle: asyncio.TimerHandle | None = None
+        self._rest: asyncio.TimerHandle | None = None
+        """Its end, while nothing more is read."""
+        self._taken_s = 0.0
+        """Processor time that the client has taken beyond its free share, seconds."""
+        self._counted_s = 0.0
         self._error_answered = False
         """Whether a malformed command in what was read last has been answered."""
         self.bus: str | None = None
@@ -142,6 +167,9 @@ class _Client(TurnProtocol):
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (asyncio's signature)
         if self._settle is not None:
             self._settle.cancel()
+        if self._rest is not None:
+            self._rest.cancel()
+            self._end_rest()
         if self in self._hub.clients:  # not rejected
             self._hub.clients.remove(self)
 
@@ -152,7 +180,36 @@ class _Client(TurnProtocol):
         self._full = False
         self._write_waiting()
 
+    def get_buffer(self, sizehint: int) -> bytearray:
+        """Return the buffer for the next bytes: the smaller, the more clients there are that may send at once."""
+        many = max(self._hub.resting, len(self._hub.clients) // 4)
+        self.read_size = max(TURN // (1 + many), LEAST_TURN)
+        return super().get_buffer(sizehint)
+
     def data_received(self, data: bytes) -> None:
+        """Process commands; a client that takes much of the loop then rests, until those have rested that rest already."""
+        loop = asyncio.get_running_loop()
+        begin_s, began_s = loop.time(), time.thread_time()
+        self._process(data)
+        now_s = loop.time()
+        free = min(FREE_SHARE, FREE_IN_ALL / len(self._hub.clients))
+        self._taken_s = max(self._taken_s - free * (now_s - self._counted_s), 0.0)
+        self._taken_s += time.thread_time() - began_s
+        self._counted_s = now_s
+        if self._taken_s > LEAST_TAKEN_S and self._rest is None and not self._transport.is_closing():
+            self._transport.pause_reading()
+            self._hub.resting += 1
+            taken_s = max(self._taken_s, now_s - begin_s)  # longer where other processes have the processor
+            self._hub.rested_s = max(self._hub.rested_s, now_s) + REST * taken_s
+            self._rest = loop.call_at(self._hub.rested_s, self._end_rest)
+
+    def _end_rest(self) -> None:
+        self._rest, self._taken_s = None, 0.0
+        self._hub.resting -= 1
+        if not self._transport.is_closing():
+            self._transport.resume_reading()
+
+    def _process(self, data: bytes) -> None:
         self._end_settling()
         self._error_answered = False
         frames: list[CanFrame] = []
@@ -258,6 +315,10 @@ class CanHub:
         self._now = now
         self._server: asyncio.Server | None = None
         self.clients: Final[list[_Client]] = []
+        self.resting = 0
+        """Number of clients from which nothing is read for now."""
+        self.rested_s = 0.0
+        """Time of the loop at which the last of them has rested, seconds."""
 
     async def start(self) -> None:
         """Listen. Raises ProtocolError if the address or the log is not available."""

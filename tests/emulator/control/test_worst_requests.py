@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.sky.objects import MAX_ROWS
 from starhil.emulator.sensor.sky.tables import OPTICAL_FAULT
 from starhil.emulator.truth.config import MAX_SEGMENTS
-from starhil.emulator.truth.feed import MAX_LINES, LiveFeed, _Datagrams
+from starhil.emulator.truth.feed import BURST, MAX_LINES, MAX_LINES_PER_S, LiveFeed, _Datagrams
 from starhil.emulator.truth.live import LiveTruth
 from starhil.hil_tests.session.script import ScriptError, load_script
 from starhil.protocol.errors import LONGEST_PROBLEM, MAX_PROBLEMS
@@ -104,6 +105,21 @@ def test_a_datagram_is_read_up_to_a_number_of_lines_and_a_length() -> None:
     assert truth.last_fault == f"datagram of more than {MAX_LINES} lines"
     datagrams.datagram_received(b'{"q": [' + b"0, " * 5000 + b"1]}", None)
     assert truth.last_fault == "message longer than 4096 bytes"
+
+
+def test_of_a_flood_of_datagrams_only_so_many_messages_per_second_are_read() -> None:
+    """A sender of messages without pause held up replies on the bus by 40 ms."""
+    truth = LiveTruth(Attitude.identity())
+    datagrams = _Datagrams(LiveFeed(truth, lambda: 1.0))
+    datagram, begin_s = b"\n".join([b'{"q": [0, 0, 0, 1]}'] * MAX_LINES), time.monotonic()
+    for _ in range(400):
+        datagrams.datagram_received(datagram, None)
+    assert BURST <= truth.accepted <= BURST + (time.monotonic() - begin_s) * MAX_LINES_PER_S + 1
+    assert truth.last_fault == "more than 2000 messages per second"
+    time.sleep(0.02)
+    before = truth.accepted
+    datagrams.datagram_received(b'{"q": [0, 0, 0, 1]}', None)
+    assert truth.accepted == before + 1
 
 
 def test_the_rest_of_a_file_with_very_many_errors_is_not_checked(tmp_path: Any) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.can.socketcand import format_send
 from starhil.protocol.transports.can import open_can
-from starhil.protocol.transports.connections import WINDOW
+from starhil.protocol.transports.connections import TURN, WINDOW
 from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub, FairQueue
 from tests.waiting import PATIENCE_S, turns, until
 
@@ -92,6 +93,38 @@ def test_a_flood_takes_the_place_of_no_other_clients_frame() -> None:
         await hub.close()
 
     asyncio.run(main())
+
+
+def test_many_clients_that_flood_a_bus_are_not_all_read_in_the_same_turn_of_the_loop() -> None:
+    """16 of them, on a bus of their own, held up replies on another bus by half a second, 50 for as long as they sent."""
+    sizes = [0]
+
+    class Counted(CanHub):
+        def distribute(self, sender: Any, frames: list[CanFrame]) -> None:
+            sizes[-1] += len(frames)
+            super().distribute(sender, frames)
+
+    async def scenario() -> None:
+        hub = Counted(port=0)
+        await hub.start()
+        floods = []
+        for _ in range(16):
+            reader, flood = await asyncio.open_connection("127.0.0.1", hub.port)
+            flood.write(b"< open vcan0 >")
+            await reader.readuntil(b"ok >")
+            flood.write(format_send(FLOOD) * 2000)
+            floods.append(flood)
+        while hub.statistics.frames < 20_000:
+            sizes.append(0)
+            await asyncio.sleep(0)
+        for flood in floods:
+            flood.transport.abort()
+        await hub.close()
+
+    asyncio.run(asyncio.wait_for(scenario(), PATIENCE_S))
+    in_a_turn = TURN // len(format_send(FLOOD)) + 1
+    busy = sorted(size for size in sizes if size)
+    assert busy[len(busy) // 2] <= 0.75 * in_a_turn
 
 
 def test_a_request_is_answered_before_most_of_a_flood_that_came_first() -> None:
