@@ -85,7 +85,9 @@ _LONGEST_STILL_PX: Final = 1.0
 """Longest trail of a star that is taken for a spot."""
 
 _MAX_FALSE_PROBABILITY: Final = Effort().max_false_probability_tracking
-"""Largest bound on the probability of an attitude that is wrong, by chance or by its uncertainty."""
+
+_MAX_ERROR_RISK: Final = 1e-4
+"""Largest risk of an error above the largest one: of 10 000 images, all at this limit, one would be wrong. Most are far below."""
 
 _WARM_UP_EXPOSURE_S: Final = 1.0
 """Exposure in which a dim sensor too sees enough stars to follow their trails, seconds."""
@@ -386,8 +388,7 @@ class Pipeline:
     def _may_be_wrong(self, solution: Solution) -> bool:
         """Whether a valid attitude may be off by more than the largest error, by its own uncertainty."""
         freedom = 2.0 * solution.star_count - 3.0 + PRIOR_FREEDOM
-        risk = error_risk(solution.covariance, freedom, self._setup.largest_error_rad)
-        return risk > _MAX_FALSE_PROBABILITY
+        return error_risk(solution.covariance, freedom, self._setup.largest_error_rad) > _MAX_ERROR_RISK
 
     def _follow(
         self,
