@@ -120,15 +120,13 @@ def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
     """Give the functions of a module, and its constants, what a changed source has."""
     file = str(module.__file__)
     compiled = compile(source, file, "exec")
-    new, old = (_by_name(code) for code in (compiled, compile(Path(file).read_text("utf-8"), file, "exec")))
+    new, old = _by_name(compiled), _healthy(file)
     fresh = {key: value for key, value in vars(module).items() if key.startswith("__")}
     exec(compiled, fresh)
     undo, changes = ExitStack(), 0
-    gc.unfreeze()  # `starhil run`, in this process, hides its objects from the collector
-    for function in [item for item in gc.get_objects() if type(item) is types.FunctionType]:
+    for function in _functions(module):
         code = function.__code__
-        ours = function.__globals__ is vars(module) and code.co_filename == file  # not made by a decorator
-        if not ours or len(new[code.co_qualname]) != len(old[code.co_qualname]):
+        if len(new[code.co_qualname]) != len(old[code.co_qualname]):
             continue
         nth = [each.co_firstlineno for each in old[code.co_qualname]].index(code.co_firstlineno)
         changed = new[code.co_qualname][nth]
@@ -147,6 +145,25 @@ def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
                 f"{module.__name__}: the change reaches no function and no constant that exists"
             )
         yield
+
+
+@functools.cache
+def _functions(module: types.ModuleType) -> list[types.FunctionType]:
+    """Return the functions that a module has made, wherever they are; what these make later is made from their code."""
+    gc.unfreeze()  # `starhil run`, in this process, hides its objects from the collector
+    functions = [each for each in gc.get_referrers(vars(module)) if type(each) is types.FunctionType]
+    return [
+        each
+        for each in functions
+        if each.__globals__ is vars(module)
+        and each.__code__.co_filename == module.__file__  # not by a decorator
+    ]
+
+
+@functools.cache
+def _healthy(file: str) -> defaultdict[str, list[types.CodeType]]:
+    """Return the code of the functions of a file as it is."""
+    return _by_name(compile(Path(file).read_text("utf-8"), file, "exec"))
 
 
 def _by_name(code: types.CodeType) -> defaultdict[str, list[types.CodeType]]:
