@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, NamedTuple, Self
 
 import numpy as np
@@ -192,7 +193,8 @@ class FeatureErrors:
                     if centre is None or sequence.exceeded
                     else search.answer_in_region(features, centre, side_deg)
                 )
-                kept = sequence.next(local, map(search.answer, (features,)), centre, first=centre is None)
+                everywhere = [partial(search.answer, features)]
+                kept = sequence.next(local, everywhere, centre, first=centre is None)
                 if kept is None:
                     break
                 kinds[kept.kind].add(kept, truth)

@@ -17,6 +17,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -273,7 +274,7 @@ class LsiIdentifier(VerifiedIdentifier):
             return self.solve(measured, zero_points)
         fields = self.fields(measured, zero_points)
         sequence = AnswerSequence(self.options.threshold, self.options.largest_error_psi)
-        kept = sequence.next(None, map(self.answer, (fields,)), None, first=True)
+        kept = sequence.next(None, [partial(self.answer, fields)], None, first=True)
         return self.by_features_alone(kept, "lsi", fields)
 
     def _track(self, measured: CheckedDetections, predicted: Attitude, window_px: float | None) -> Solution:
