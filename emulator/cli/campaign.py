@@ -224,7 +224,9 @@ class PlanOptions:
     ] = None
     orbit: OrbitChoice = None
     setting: Settings = None
-    fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0
+    fov: Annotated[
+        float | None, typer.Option(help="Full width of the field of view, degrees; default: 42.")
+    ] = None
     unknown_field: Annotated[
         bool,
         typer.Option("--unknown-field", help="Identify without knowing --fov, like `identify --fov auto`."),
@@ -271,11 +273,12 @@ class PlanOptions:
     def plan(self) -> CampaignPlan:
         """Return the plan."""
         from starhil.emulator.benchmarks.campaign import CampaignPlan
+        from starid.camera import DEFAULT_FOV_DEG
 
         return CampaignPlan(
             self.frames,
             self.seed,
-            self.fov,
+            DEFAULT_FOV_DEG if self.fov is None else self.fov,
             self.rate,
             self.blocked,
             self.algorithm,
@@ -329,7 +332,7 @@ def lost_in_space(
         plan = images.plan()
         with _backend(dask, jobs):
             chunks = list(_with_progress(run_campaign(plan, folder=output, jobs=jobs), plan.chunks))
-        figures |= summarise(np.concatenate(chunks), images.fov)
+        figures |= summarise(np.concatenate(chunks), plan.fov_deg)
     if as_json:
         print(json.dumps(figures))
     else:

@@ -35,6 +35,9 @@ from starid.errors import StaridError
 
 Model = Literal["pinhole", "equidistant", "flat"]
 
+DEFAULT_FOV_DEG: Final = 42.0
+"""Width of the field of the thesis's sensor, degrees."""
+
 _MODEL_CODES: Final[dict[str, int]] = {"pinhole": PINHOLE, "equidistant": EQUIDISTANT, "flat": FLAT}
 _WIDEST_FOV_DEG: Final[dict[str, float]] = {"pinhole": 170.0, "equidistant": 360.0, "flat": 360.0}
 _MAX_SIDE: Final = 65535
@@ -96,7 +99,7 @@ class Camera:
     @classmethod
     def from_fov(
         cls,
-        fov_deg: float = 42.0,
+        fov_deg: float = DEFAULT_FOV_DEG,
         width: int = 937,
         height: int = 937,
         model: Model = "pinhole",
