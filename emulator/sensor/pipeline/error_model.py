@@ -95,7 +95,6 @@ class ErrorModel:
         """Do nothing: there is no process."""
 
     def end(self, reason: str) -> None:
-        """End unexpectedly."""
         self._running = False
         self.ended.emit(reason)
 
