@@ -17,6 +17,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import Jobs, OrbitChoice, Seed, Settings, names_of, with_orbit
+from starid.camera import DEFAULT_FOV_DEG
 from starid.cli.options import AsJson
 from starid.cli.output import Column, print_table
 from starid.storage.child_processes import importing_only_what_is_installed
@@ -224,9 +225,7 @@ class PlanOptions:
     ] = None
     orbit: OrbitChoice = None
     setting: Settings = None
-    fov: Annotated[
-        float | None, typer.Option(help="Full width of the field of view, degrees; default: 42.")
-    ] = None
+    fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = DEFAULT_FOV_DEG
     unknown_field: Annotated[
         bool,
         typer.Option("--unknown-field", help="Identify without knowing --fov, like `identify --fov auto`."),
@@ -273,12 +272,11 @@ class PlanOptions:
     def plan(self) -> CampaignPlan:
         """Return the plan."""
         from starhil.emulator.benchmarks.campaign import CampaignPlan
-        from starid.camera import DEFAULT_FOV_DEG
 
         return CampaignPlan(
             self.frames,
             self.seed,
-            DEFAULT_FOV_DEG if self.fov is None else self.fov,
+            self.fov,
             self.rate,
             self.blocked,
             self.algorithm,
