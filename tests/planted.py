@@ -1,8 +1,8 @@
 """Errors planted in the running product, so that whatever shares its code has them: a text in a module becomes another.
 
 The changed module is compiled, and its functions that exist get the new code, wherever they have been imported to; constants
-of the module are replaced in it. A text that is not there exactly once, or whose change reaches nothing that exists, raises
-`LostAimError`: move the aim, do not drop the error.
+of the module that change, or are computed from what changes, are computed again. A text that is not there exactly once, or
+whose change reaches nothing that exists, raises `LostAimError`: move the aim, do not drop the error.
 """
 
 from __future__ import annotations
@@ -119,10 +119,8 @@ def _part(source: str, edit: Edit) -> tuple[int, int, str]:
 def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
     """Give the functions of a module, and its constants, what a changed source has."""
     file = str(module.__file__)
-    compiled = compile(source, file, "exec")
-    new, old = _by_name(compiled), _healthy(file)
-    fresh = {key: value for key, value in vars(module).items() if key.startswith("__")}
-    exec(compiled, fresh)
+    texts = source, Path(file).read_text(encoding="utf-8")
+    new, old = (_by_name(_compiled(text, file)) for text in texts)
     undo, changes = ExitStack(), 0
     for function in _functions(module):
         code = function.__code__
@@ -134,9 +132,10 @@ def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
             changes += _meaning(changed) != _meaning(code)
             function.__code__ = changed
             undo.callback(setattr, function, "__code__", code)
-    for key, value in [*vars(module).items()]:
-        if type(value) in _CONSTANTS and key in fresh and fresh[key] != value and not key.startswith("__"):
-            setattr(module, key, fresh[key])
+    for key, fresh in _constants(module, *texts).items():
+        value = getattr(module, key, None)
+        if type(value) in _CONSTANTS and fresh != value:
+            setattr(module, key, fresh)
             undo.callback(setattr, module, key, value)
             changes += 1
     with undo:
@@ -154,16 +153,44 @@ def _functions(module: types.ModuleType) -> list[types.FunctionType]:
     functions = [each for each in gc.get_referrers(vars(module)) if type(each) is types.FunctionType]
     return [
         each
-        for each in functions
-        if each.__globals__ is vars(module)
-        and each.__code__.co_filename == module.__file__  # not by a decorator
+        for each in functions  # not those that a decorator of another module has made
+        if each.__globals__ is vars(module) and each.__code__.co_filename == module.__file__
     ]
 
 
 @functools.cache
-def _healthy(file: str) -> defaultdict[str, list[types.CodeType]]:
-    """Return the code of the functions of a file as it is."""
-    return _by_name(compile(Path(file).read_text("utf-8"), file, "exec"))
+def _compiled(source: str, file: str) -> types.CodeType:
+    return compile(source, file, "exec")
+
+
+def _constants(module: types.ModuleType, source: str, old_source: str) -> dict[str, object]:
+    """Return the constants of a module that a change of its source reaches.
+
+    They are computed with the module's own classes: a table whose keys were members of a second enumeration of the same name
+    would find nothing.
+    """
+    old = {ast.dump(statement) for statement in ast.parse(old_source).body}
+    values = dict(vars(module))
+    changed: set[str] = set()
+    constants: dict[str, object] = {}
+    for statement in ast.parse(source).body:
+        if ast.dump(statement) in old and not changed & _names(statement, ast.Load):
+            continue
+        if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            changed.add(statement.name)
+        elif isinstance(statement, (ast.Assign, ast.AnnAssign)):
+            assigned = ast.Module([statement], [])
+            exec(compile(assigned, str(module.__file__), "exec", annotations.compiler_flag), values)
+            names = _names(statement, ast.Store)
+            changed |= names
+            constants |= {name: values[name] for name in names}
+    return constants
+
+
+def _names(statement: ast.stmt, use: type[ast.expr_context]) -> set[str]:
+    return {
+        node.id for node in ast.walk(statement) if isinstance(node, ast.Name) and isinstance(node.ctx, use)
+    }
 
 
 def _by_name(code: types.CodeType) -> defaultdict[str, list[types.CodeType]]:
