@@ -1,8 +1,8 @@
 """Errors planted in the running product, so that whatever shares its code has them: a text in a module becomes another.
 
 The changed module is compiled, and its functions that exist get the new code, wherever they have been imported to; constants
-of the module are replaced in it. A text that is not there exactly once, or whose change reaches nothing that exists, raises
-`LostAimError`: move the aim, do not drop the error.
+of the module that change, or are computed from what changes, are computed again. A text that is not there exactly once, or
+whose change reaches nothing that exists, raises `LostAimError`: move the aim, do not drop the error.
 """
 
 from __future__ import annotations
@@ -119,10 +119,8 @@ def _part(source: str, edit: Edit) -> tuple[int, int, str]:
 def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
     """Give the functions of a module, and its constants, what a changed source has."""
     file = str(module.__file__)
-    compiled = compile(source, file, "exec")
-    new, old = (_by_name(code) for code in (compiled, compile(Path(file).read_text("utf-8"), file, "exec")))
-    fresh = {key: value for key, value in vars(module).items() if key.startswith("__")}
-    exec(compiled, fresh)
+    texts = source, Path(file).read_text(encoding="utf-8")
+    new, old = (_by_name(compile(text, file, "exec")) for text in texts)
     undo, changes = ExitStack(), 0
     gc.unfreeze()  # `starhil run`, in this process, hides its objects from the collector
     for function in [item for item in gc.get_objects() if type(item) is types.FunctionType]:
@@ -136,9 +134,10 @@ def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
             changes += _meaning(changed) != _meaning(code)
             function.__code__ = changed
             undo.callback(setattr, function, "__code__", code)
-    for key, value in [*vars(module).items()]:
-        if type(value) in _CONSTANTS and key in fresh and fresh[key] != value and not key.startswith("__"):
-            setattr(module, key, fresh[key])
+    for key, fresh in _constants(module, *texts).items():
+        value = getattr(module, key, None)
+        if type(value) in _CONSTANTS and fresh != value:
+            setattr(module, key, fresh)
             undo.callback(setattr, module, key, value)
             changes += 1
     with undo:
@@ -147,6 +146,36 @@ def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
                 f"{module.__name__}: the change reaches no function and no constant that exists"
             )
         yield
+
+
+def _constants(module: types.ModuleType, source: str, old_source: str) -> dict[str, object]:
+    """Return the constants of a module that a change of its source reaches.
+
+    They are computed with the module's own classes: a table whose keys were members of a second enumeration of the same name
+    would find nothing.
+    """
+    old = {ast.dump(statement) for statement in ast.parse(old_source).body}
+    values = dict(vars(module))
+    changed: set[str] = set()
+    constants: dict[str, object] = {}
+    for statement in ast.parse(source).body:
+        if ast.dump(statement) in old and not changed & _names(statement, ast.Load):
+            continue
+        if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            changed.add(statement.name)
+        elif isinstance(statement, (ast.Assign, ast.AnnAssign)):
+            assigned = ast.Module([statement], [])
+            exec(compile(assigned, str(module.__file__), "exec", annotations.compiler_flag), values)
+            names = _names(statement, ast.Store)
+            changed |= names
+            constants |= {name: values[name] for name in names}
+    return constants
+
+
+def _names(statement: ast.stmt, use: type[ast.expr_context]) -> set[str]:
+    return {
+        node.id for node in ast.walk(statement) if isinstance(node, ast.Name) and isinstance(node.ctx, use)
+    }
 
 
 def _by_name(code: types.CodeType) -> defaultdict[str, list[types.CodeType]]:

@@ -25,12 +25,13 @@ def test_the_installed_version_matches_the_project():
 
 
 @pytest.mark.process
-def test_the_command_prints_the_version():
+@pytest.mark.parametrize("program", ["starhil", "starid"])
+def test_the_package_is_run_as_its_command(program):
     done = subprocess.run(
-        [sys.executable, "-c", "from starhil.emulator.cli import main; main()", "--version"],
+        [sys.executable, "-m", program, "--version"],
         capture_output=True, text=True, timeout=PATIENCE_S, check=True,
     )  # fmt: skip
-    assert done.stdout == f"starhil {project_version()}\n"
+    assert done.stdout == f"{program} {project_version()}\n"
 
 
 def test_the_citation_names_the_version():

@@ -112,9 +112,9 @@ class DeviceConfig(Strict):
     tracking_stars: Literal[0] | Annotated[int, Field(ge=2, le=50)] = 2
     """Least number of matched stars in tracking, where the predicted attitude verifies few stars, which may then be fainter
     (3 sigmas). 0: `min_stars_matched`, as lost in space."""
-    tracking_error_deg: Annotated[float, Field(ge=0.001, le=10.0)] = 0.1
-    """Largest error of an attitude by few stars that may go unnoticed if the predicted attitude is wrong by many times its
-    uncertainty, degrees. Smaller values reject more frames with a mostly covered field."""
+    largest_error_deg: Annotated[float, Field(ge=0.001, le=10.0)] = 0.1
+    """Largest error across or about the boresight that an attitude may have, degrees: it is invalid if, by its own uncertainty, a
+    larger one is likelier than 1e-4, or, with few stars in tracking, if an error of the prediction could cause one unnoticed."""
     tracking_windows: bool = False
     """Whether the unit searches only windows around the predicted stars when it tracks, and the whole image only if that fails."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0

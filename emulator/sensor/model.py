@@ -222,11 +222,12 @@ class SensorModel:
         return Digitizer(self.read_noise_e, self.full_well_e, self.gain_e_per_dn, self.offset_dn, self.max_dn)
 
     def detection_settings(self, **changes: Any) -> DetectionSettings:
-        """Return detection settings with gain, saturation and, if uniform over the image, spot width."""
+        """Return detection settings with gain, saturation, growth of the spot and, if uniform over the image, its width."""
         from starid.imaging.detection import DetectionSettings
 
         settings = DetectionSettings(
             psf_sigma_px=self.psf_sigma_px if self.psf_growth == 0.0 else None,
+            psf_growth=self.psf_growth,
             gain_e_per_dn=self.gain_e_per_dn,
             saturation_dn=self.saturation_dn,
         )

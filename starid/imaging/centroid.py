@@ -17,7 +17,7 @@ import numpy as np
 from starid.arithmetic.arrays import Array, Array32, record_type
 from starid.arithmetic.elementary import hypot
 from starid.imaging.normal_table import normal, quick_normal
-from starid.kernels.jit import compiled_ieee
+from starid.kernels.jit import compiled_ieee, inner
 
 UNUSABLE: Final = 1e9
 """Least count at which a pixel of a window has no weight: saturated and masked pixels are set to infinity."""
@@ -69,8 +69,19 @@ _SETTLED_PX: Final = 0.02
 _MAX_STEP_PX: Final = 1.0
 _MIN_PIXELS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
+_MEAN_SQUARE: Final = 2.0 / 3.0
 SHORT_TRAIL_PX: Final = 0.5
 """Trails shorter than this are fitted as round spots, pixels."""
+
+
+@inner
+def relative_width(x: float, y: float, width: int, height: int, growth: float) -> float:
+    """Width of a spot over its mean in an image of a size, if it grows with the square of the distance from the centre.
+
+    `growth` is that from the centre to the middle of an edge; in a square image, the mean square of the distance is 2/3 of that.
+    """
+    off_x, off_y = (2.0 * x + 1.0) / width - 1.0, (2.0 * y + 1.0) / height - 1.0
+    return (1.0 + growth * (off_x * off_x + off_y * off_y)) / (1.0 + growth * _MEAN_SQUARE)
 
 
 @compiled_ieee

@@ -102,7 +102,9 @@ class DetectionSettings:
     threshold_sigma : float
         Smallest ratio of the smoothed peak to its noise.
     psf_sigma_px : float or None
-        Standard deviation of a star's spot; estimated from the image if None.
+        Standard deviation of a star's spot, its mean over the image; estimated from the image if None.
+    psf_growth : float
+        Growth of the spot, relative to that in the centre, up to the middle of an edge; twice as much in the corners.
     gain_e_per_dn : float or None
         Electrons per count; if given, errors include shot noise and fluxes are in electrons.
     saturation_dn : int or None
@@ -125,6 +127,7 @@ class DetectionSettings:
 
     threshold_sigma: float = 5.5
     psf_sigma_px: float | None = None
+    psf_growth: float = 0.0
     gain_e_per_dn: float | None = None
     saturation_dn: int | None = None
     model_error: float = 0.01
@@ -140,6 +143,7 @@ class DetectionSettings:
         ranges = {
             "threshold_sigma": (1.0, 1000.0),
             "psf_sigma_px": (0.3, 12.0),
+            "psf_growth": (0.0, 10.0),
             "gain_e_per_dn": (1e-6, 1e9),
             "saturation_dn": (1, 65535),
             "model_error": (0.0, 1.0),
@@ -252,7 +256,7 @@ class _Fits:
     pixels: Grid
     first: Indices32
     neighbours: Indices32
-    sensor: tuple[float, float, float, float, float]
+    sensor: tuple[float, float, float, float]
     lit: tuple[float, float, float]
     size: tuple[int, int]
     stars: Records
@@ -489,7 +493,7 @@ def _stand_out(scene: _Scene, peaks: Indices32, heights: Grid, sigma_px: float) 
     """Which peaks (n,) are above the threshold over the sky in a ring around them, if it is even."""
     background = scene.background
     windows = np.zeros(len(peaks), WINDOW)
-    spot = (sigma_px, scene.saturation, background.median_noise)
+    spot = (sigma_px, scene.settings.psf_growth, scene.saturation, background.median_noise)
     factor = noise_factor(spot_taps(sigma_px))
     flux = heights / np.float32(square(factor))
     lay_windows(scene.counts, peaks, flux, *scene.grids, spot, np.zeros(FLOW_TERMS), windows)
@@ -527,7 +531,9 @@ def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float, least: int)
         shape = dataclasses.replace(shape, flow=np.zeros_like(shape.flow), trail_px=0.0)
     if settings.psf_sigma_px is None and shape.trail_px == 0.0:
         widths = np.empty(_STARS_FOR_WIDTH)
-        fitted = spot_widths(scene.counts, tries, *scene.grids, start, scene.saturation, widths)
+        fitted = spot_widths(
+            scene.counts, tries, *scene.grids, start, scene.saturation, settings.psf_growth, widths
+        )
         if fitted >= least:
             shape = dataclasses.replace(shape, sigma_px=float(np.median(widths[:fitted])), stars=fitted)
     return shape
@@ -597,7 +603,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
     flux = heights / np.float32(square(noise_factor(spot_taps(shape.sigma_px))))
     count = len(peaks)
     windows = np.zeros(count, WINDOW)
-    spot = (shape.sigma_px, scene.saturation, background.median_noise)
+    spot = (shape.sigma_px, settings.psf_growth, scene.saturation, background.median_noise)
     total = lay_windows(counts, peaks, flux, *scene.grids, spot, shape.flow, windows)
     pixels = np.empty(total, dtype=np.float32)
     cut_windows(counts, windows, *scene.level, scene.saturation, pixels)
@@ -612,7 +618,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
         pixels,
         first,
         neighbours,
-        (shape.sigma_px, per_dn, settings.model_error, ratio, scene.saturation - background.median_level),
+        (per_dn, settings.model_error, ratio, scene.saturation - background.median_level),
         (settings.pixel_sigma, float(settings.min_star_pixels), float(settings.max_star_pixels)),
         (counts.shape[1], counts.shape[0]),
         stars,
@@ -632,7 +638,7 @@ def _with_companions(fits: _Fits, blend_px: float) -> _Fits:
     partners, owners = np.empty(len(suspects), FIT), np.empty(len(suspects), dtype=np.int64)
     near = (fits.first, fits.neighbours)
     pair_count = split_pairs(
-        fits.windows, fits.pixels, *near, fits.sensor[:3], stars, suspects, blend_px, partners, owners, bad
+        fits.windows, fits.pixels, *near, fits.sensor[:2], stars, suspects, blend_px, partners, owners, bad
     )
     fits.measure(bad, REFIT_ROUNDS)
     owners = owners[:pair_count]
@@ -668,9 +674,7 @@ def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detecti
         stars[variance] *= np.where(is_bad, misfit, 1.0)
     doubt_close_pairs(stars, np.argsort(-stars["y"], kind="stable"), settings.blend_px)
     windows = fits.windows[good]
-    step = shift_by_edge(
-        windows, fits.pixels, stars["flux"], background, settings.gain_e_per_dn, shape.sigma_px
-    )
+    step = shift_by_edge(windows, fits.pixels, stars["flux"], background, settings.gain_e_per_dn)
     uneven = square(step)
     stars["var_x"] += uneven
     stars["var_y"] += uneven

@@ -241,7 +241,7 @@ def measure(
     pixels: Array32,
     first: Indices32,
     neighbours: Indices32,
-    sensor: tuple[float, float, float, float, float],
+    sensor: tuple[float, float, float, float],
     lit: tuple[float, float, float],
     size: tuple[int, int],
     todo: Mask,
@@ -260,8 +260,8 @@ def measure(
         From `lay_windows` and `cut_windows`, the brightest star first.
     first, neighbours
         From `find_neighbours`.
-    sensor : (float, float, float, float, float)
-        Standard deviation of the spot, pixels; variance in counts² per count of star light; model error;
+    sensor : (float, float, float, float)
+        Variance in counts² per count of star light; model error;
         smallest signal-to-noise ratio of a star; saturation in counts above the sky.
     lit : (float, float, float)
         Sigmas from which a pixel is lit; smallest and largest number of lit pixels of a star.
@@ -277,7 +277,7 @@ def measure(
     flags : ndarray (n,)
         Filled with bits `SATURATED`, `AT_EDGE`.
     """
-    sigma, per_dn, model_error, least_ratio, saturation_dn = sensor
+    per_dn, model_error, least_ratio, saturation_dn = sensor
     largest, side = 1, _MIN_SIDE
     for k in range(windows.shape[0]):
         if windows[k].columns > 0:
@@ -302,6 +302,7 @@ def measure(
             count = bounds[2] * bounds[3]
             begin = window.offset
             own = pixels[begin : begin + count]
+            sigma = window.sigma
             shape = (sigma, window.trail_x, window.trail_y)
             target = own
             if not alone:
@@ -328,14 +329,14 @@ def measure(
                 star.state = NOT_A_STAR
             if star.state == GOOD:
                 flags[k] = _flags(star, window, own, sigma, size)
-        _drop_doubles(stars, first, neighbours, sigma)
+        _drop_doubles(stars, windows, first, neighbours)
 
 
 @compiled_ieee
-def _drop_doubles(stars: Records, first: Indices32, neighbours: Indices32, sigma: float) -> None:
+def _drop_doubles(stars: Records, windows: Records, first: Indices32, neighbours: Indices32) -> None:
     """Mark the fainter of two fits with the same position."""
-    reach = max(0.7 * sigma, 0.5)
     for k in range(stars.shape[0]):
+        reach = max(0.7 * windows[k].sigma, 0.5)
         for place in range(first[k], first[k + 1]):
             other = neighbours[place]
             if (

@@ -288,7 +288,7 @@ def warm_up() -> None:
     )
     pixels, near = np.empty(0, dtype=np.float32), (np.zeros(2, dtype=np.int32), np.empty(0, dtype=np.int32))
     partners, none = np.empty(0, FIT), np.empty(0, dtype=np.int64)
-    split_pairs(windows, pixels, *near, (1.0, 0.0, 0.0), stars, none, 0.0, partners, none, todo)
+    split_pairs(windows, pixels, *near, (0.0, 0.0), stars, none, 0.0, partners, none, todo)
 
 
 @compiled_ieee
@@ -297,7 +297,7 @@ def split_pairs(
     pixels: Array32,
     first: Indices32,
     neighbours: Indices32,
-    noise: tuple[float, float, float],
+    noise: tuple[float, float],
     stars: Records,
     suspects: Indices,
     blend_px: float,
@@ -311,8 +311,8 @@ def split_pairs(
     ----------
     windows, pixels, first, neighbours, stars
         See `starid.imaging.measurement.measure`, which must have been called.
-    noise : (float, float, float)
-        Standard deviation of the spot, pixels; variance in counts² per count of star light; model error.
+    noise : (float, float)
+        Variance in counts² per count of star light; model error.
     suspects : ndarray (m,)
         Indices of the stars to try.
     blend_px : float
@@ -329,7 +329,7 @@ def split_pairs(
     int
         Number of pairs resolved as two stars.
     """
-    sigma, per_dn, model_error = noise
+    per_dn, model_error = noise
     largest, side = 1, _MIN_SIDE
     for k in suspects:
         largest = max(largest, windows[k].columns * windows[k].rows)
@@ -346,6 +346,7 @@ def split_pairs(
         bounds = (window.left, window.top, window.columns, window.rows)
         count = bounds[2] * bounds[3]
         begin = window.offset
+        sigma = window.sigma
         shape = (sigma, window.trail_x, window.trail_y)
         target = cleaned[:count]
         copy_values(pixels[begin:], target)

@@ -9,7 +9,7 @@ import numpy as np
 
 from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices32
 from starid.imaging.background import interpolate_at
-from starid.imaging.centroid import FIT, GOOD, Fit, fit_star, spot_model
+from starid.imaging.centroid import FIT, GOOD, Fit, fit_star, relative_width, spot_model
 from starid.kernels.jit import compiled_ieee
 
 NARROWEST_PX: Final = 0.25
@@ -98,9 +98,10 @@ def spot_widths(
     block: float,
     start: float,
     saturation: float,
+    growth: float,
     widths: Array,
 ) -> int:
-    """Fill `widths` (m,) with the spot widths at the first peaks that can be fitted; return their number.
+    """Fill `widths` (m,) with the mean widths in the image by the first peaks that can be fitted; return their number.
 
     Parameters
     ----------
@@ -114,6 +115,8 @@ def spot_widths(
         First guess, pixels.
     saturation : float
         Smallest count of a saturated pixel; saturated stars are rejected.
+    growth : float
+        Growth of the spot towards the edge (`starid.imaging.centroid.relative_width`).
     """
     count = 0
     result: Fit = np.empty(1, FIT)[0]
@@ -126,6 +129,6 @@ def spot_widths(
         spread = interpolate_at(noise, block, x, y)
         width = _one_width(image, column, row, sky, max(spread, 1e-3), start, saturation, result)
         if width == width:
-            widths[count] = width
+            widths[count] = width / relative_width(x, y, image.shape[1], image.shape[0], growth)
             count += 1
     return count

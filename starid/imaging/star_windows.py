@@ -70,7 +70,8 @@ def detect_near(
     for number in range(rows * columns):  # the last row is filled up with the first tiles
         x, y = corners[number % used.size]
         tiles[row[number], :, column[number]] = image[y : y + TILE_PX, x : x + TILE_PX]
-    quiet = dataclasses.replace(settings, follow_trails=False, block_px=BLOCK_PX)
+    # a place in the mosaic is not that in the image, so its spots have one width
+    quiet = dataclasses.replace(settings, follow_trails=False, block_px=BLOCK_PX, psf_growth=0.0)
     mosaic = tiles.reshape(rows * TILE_PX, columns * TILE_PX)
     detections = detect(mosaic, quiet)
     at = np.clip(np.floor((detections.xy_px + 0.5) / TILE_PX).astype(np.int64), 0, (columns - 1, rows - 1))

@@ -39,7 +39,6 @@ def shift_by_edge(
     flux: Array,
     background: Background,
     gain_e_per_dn: float | None,
-    sigma_px: float,
 ) -> Array:
     """Return how far (n,) an edge in the background may have shifted the fits of stars, pixels.
 
@@ -65,8 +64,9 @@ def shift_by_edge(
         if darkest > dark[k]:
             step[k] = max(step[k], darkest)
     trail2 = square(windows["trail_x"]) + square(windows["trail_y"])
-    reach = np.sqrt(trail2 + square(4.0 / math.sqrt(2.0 * math.pi) * sigma_px))
-    return np.asarray(2.0 * math.pi * square(sigma_px) * reach * step / flux, dtype=np.float64)
+    sigma = windows["sigma"]
+    reach = np.sqrt(trail2 + square(4.0 / math.sqrt(2.0 * math.pi) * sigma))
+    return np.asarray(2.0 * math.pi * square(sigma) * reach * step / flux, dtype=np.float64)
 
 
 def shift_by_hidden_stars(flux: Array, length: Array, sigma_px: float, size: tuple[int, int]) -> Array:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from starid.arithmetic.arrays import Array, Array32, GreyImage, Indices32, Records, record_type
 from starid.arithmetic.elementary import cos, log, sin
 from starid.imaging.background import MIN_NOISE_DN, interpolate_at
+from starid.imaging.centroid import relative_width
 from starid.imaging.trail_flow import trail_at
 from starid.kernels.jit import compiled_ieee
 
@@ -28,6 +29,8 @@ class Window(Protocol):
         First guess of the star's position, image pixels.
     base, noise : float
         Sky at the first guess, and noise of a pixel, counts.
+    sigma : float
+        Standard deviation of the spot there, pixels.
     patch : float
         Half-width of the saturated patch, pixels.
     trail_x, trail_y : float
@@ -45,6 +48,7 @@ class Window(Protocol):
     start_y: float
     base: float
     noise: float
+    sigma: float
     patch: float
     trail_x: float
     trail_y: float
@@ -266,7 +270,7 @@ def lay_windows(
     level: Array32,
     noise: Array32,
     block: float,
-    spot: tuple[float, float, float],
+    spot: tuple[float, float, float, float],
     flow: Array,
     windows: Records,
 ) -> int:
@@ -282,8 +286,9 @@ def lay_windows(
         First guess of the flux, counts.
     level, noise, block
         Background on its grid, and the side of a block.
-    spot : (float, float, float)
-        Standard deviation of the spot, pixels; saturation and typical noise of a pixel, counts.
+    spot : (float, float, float, float)
+        Mean standard deviation of the spot, pixels; its growth (`starid.imaging.centroid.relative_width`); saturation and
+        typical noise of a pixel, counts.
     flow : ndarray (5,)
         Flow of the trails (`starid.imaging.trail_flow`).
     windows : ndarray (n,) of WINDOW
@@ -295,7 +300,7 @@ def lay_windows(
         Number of pixels in all windows together.
     """
     height, width = image.shape
-    sigma, saturation, typical_noise = spot
+    sigma, growth, saturation, typical_noise = spot
     ring = np.empty(_RING_PIXELS)
     circle = np.empty((2, _RING_PIXELS))
     for k in range(_RING_PIXELS):
@@ -311,6 +316,7 @@ def lay_windows(
         column, row = peaks[k, 0], peaks[k, 1]
         patch = patches[patch_count]
         patch[0], patch[1], patch[2] = column, row, 0.0
+        window.sigma = sigma * relative_width(float(column), float(row), width, height, growth)
         if image[row, column] >= saturation:
             if _in_patches(column, row, patches, patch_count):
                 window.columns = DUPLICATE
@@ -321,7 +327,7 @@ def lay_windows(
             patch_count = min(patch_count + 1, _MAX_PATCHES - 1)
         x, y, extra = patch[0], patch[1], patch[2]
         trail_x, trail_y = trail_at(flow, x, y, width, height)
-        radius = light_radius(sigma, float(flux[k]), typical_noise)
+        radius = light_radius(window.sigma, float(flux[k]), typical_noise)
         radius_x = min(math.ceil(radius + 0.5 * abs(trail_x) + extra), LARGEST_HALF_WIDTH)
         radius_y = min(math.ceil(radius + 0.5 * abs(trail_y) + extra), LARGEST_HALF_WIDTH)
         centre_x, centre_y = round(x), round(y)

@@ -112,8 +112,8 @@ class PipelineSetup:
     exact."""
     tracking_stars: int = 2
     """Least number of stars in tracking if the error of the prediction is known; 0: as lost in space."""
-    tracking_error_rad: float = math.radians(0.1)
-    """Largest error that few stars may leave unnoticed if the prediction is wrong, radians."""
+    largest_error_rad: float = math.radians(0.1)
+    """Largest error of an attitude across or about the boresight, radians; see `largest_error_deg` of a profile."""
     tracking_windows: bool = False
     """Whether to search only windows around predicted stars first, when tracking."""
     exposure_s: float = 0.2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import itertools
-import math
 import subprocess
 import time
 from dataclasses import dataclass, field, replace
@@ -50,7 +49,7 @@ from starhil.emulator.sensor.sky.objects import SkyObjects
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.arithmetic.arrays import Array, Mask
-from starid.arithmetic.elementary import hypot, log10
+from starid.arithmetic.elementary import log10
 from starid.arithmetic.matrices import length, lengths
 from starid.attitude import ARCSEC_PER_RAD, Attitude
 from starid.camera import Camera
@@ -58,6 +57,7 @@ from starid.camera.position_errors import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
 from starid.catalog.aberration import aberrated
 from starid.errors import StaridError
+from starid.identification.error_risk import error_risk, largest_across_rad
 from starid.identification.geometric.identifier import Effort
 from starid.identification.geometric.index_choice import pixels_per_radian
 from starid.identification.geometric.pattern_index import resolved_stars
@@ -85,6 +85,9 @@ _LONGEST_STILL_PX: Final = 1.0
 """Longest trail of a star that is taken for a spot."""
 
 _MAX_FALSE_PROBABILITY: Final = Effort().max_false_probability_tracking
+
+_MAX_ERROR_RISK: Final = 1e-4
+"""Largest risk of an error above the largest one: of 10 000 images, all at this limit, one would be wrong. Most are far below."""
 
 _WARM_UP_EXPOSURE_S: Final = 1.0
 """Exposure in which a dim sensor too sees enough stars to follow their trails, seconds."""
@@ -373,15 +376,19 @@ class Pipeline:
             reason = (
                 Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
             )
-            rejected = Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
-            return replace(rejected, features=solution.features)
-        if self._calibration is None:
-            return solution
-        camera, used = calibrated_camera(self.camera, settings), solution.detection_index
-        covariance, noise_px = attitude_covariance(
-            camera, self._calibration, xy[used], errors[used], offsets, PRIOR_FREEDOM
-        )
-        return replace(solution, covariance=covariance, sigma_px=noise_px)
+            return _rejected(solution, reason)
+        if self._calibration is not None:
+            camera, used = calibrated_camera(self.camera, settings), solution.detection_index
+            covariance, noise_px = attitude_covariance(
+                camera, self._calibration, xy[used], errors[used], offsets, PRIOR_FREEDOM
+            )
+            solution = replace(solution, covariance=covariance, sigma_px=noise_px)
+        return _rejected(solution, Reason.TOO_FEW_STARS) if self._may_be_wrong(solution) else solution
+
+    def _may_be_wrong(self, solution: Solution) -> bool:
+        """Whether a valid attitude may be off by more than the largest error, by its own uncertainty."""
+        freedom = 2.0 * solution.star_count - 3.0 + PRIOR_FREEDOM
+        return error_risk(solution.covariance, freedom, self._setup.largest_error_rad) > _MAX_ERROR_RISK
 
     def _follow(
         self,
@@ -392,7 +399,10 @@ class Pipeline:
         detections: Detections,
         failed: Solution,
     ) -> tuple[Detections, Solution]:
-        """Look for few and faint stars where a prediction expects them; return detections and solution, or those given."""
+        """Combine a prediction with the few and faint stars where it expects them; return detections and solution.
+
+        Without agreement, the given ones are returned: an attitude that is less certain than the prediction is then invalid.
+        """
         covariance, least = request.prediction_covariance, self._setup.tracking_stars
         predicted = self._window_centre(request)
         if covariance is None or least == 0 or predicted is None or self._leaves_trails(request):
@@ -415,10 +425,10 @@ class Pipeline:
         solution = solve_with_prediction(
             camera, stars, seen, predicted, covariance,
             2.5 * log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY,
-            self._setup.tracking_error_rad, rivals=rivals, observer_velocity=request.observer_velocity, known=self._calibration,
+            self._setup.largest_error_rad, rivals=rivals, observer_velocity=request.observer_velocity, known=self._calibration,
         )  # fmt: skip
-        if not solution.valid or solution.star_count < least:
-            return detections, failed
+        if not solution.valid or solution.star_count < least or self._may_be_wrong(solution):
+            return detections, _rejected(failed, Reason.PREDICTION_LOST) if failed.valid else failed
         rows = identifier.catalog.index_of(solution.hip).astype(np.int64)
         return seen, replace(solution, catalog_index=rows)
 
@@ -535,7 +545,7 @@ class Pipeline:
             reason=reason,
             tracked=solution.mode == "tracking",
             quaternion_xyzw=(x, y, z, w),
-            sigma_cross_arcsec=_largest_across_rad(solution.covariance) * ARCSEC_PER_RAD if valid else 0.0,
+            sigma_cross_arcsec=largest_across_rad(solution.covariance) * ARCSEC_PER_RAD if valid else 0.0,
             sigma_roll_arcsec=solution.roll_sigma_arcsec if valid else 0.0,
             covariance_rad2=as_rows(solution.covariance) if valid else None,
             rate_rad_s=None if rate is None else (float(rate[0]), float(rate[1]), float(rate[2])),
@@ -563,12 +573,6 @@ class Pipeline:
         return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
 
 
-def _largest_across_rad(covariance: Array) -> float:
-    """Return the largest standard deviation about an axis across the boresight, from the covariance (3, 3) of a rotation vector."""
-    (xx, xy), (_, yy) = covariance[:2, :2].tolist()
-    return math.sqrt(0.5 * (xx + yy) + hypot(0.5 * (xx - yy), xy))
-
-
 def _offsets(identifier: StarIdentifier, solution: Solution, xy: Array, request: FrameRequest) -> Array:
     """Return the distances (m, 2) of the matched stars from their expected positions, pixels."""
     icrs = identifier.catalog.vectors[solution.catalog_index]
@@ -581,6 +585,12 @@ def _offsets(identifier: StarIdentifier, solution: Solution, xy: Array, request:
 def _camera_of(solution: Solution, identifier: StarIdentifier) -> Camera:
     """Return the camera with which an attitude was found: the calibrated one, or that one refined by the solution."""
     return identifier.camera if solution.camera is None else solution.camera
+
+
+def _rejected(solution: Solution, reason: Reason) -> Solution:
+    """Return an invalid solution in place of one that is not good enough."""
+    rejected = Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
+    return replace(rejected, features=solution.features)
 
 
 def _less_certain(solution: Solution, request: FrameRequest) -> bool:

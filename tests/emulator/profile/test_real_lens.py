@@ -107,19 +107,19 @@ def test_bright_stars_that_a_wrong_calibration_keeps_out_of_the_solution_are_not
 
 
 def test_what_is_known_of_a_wrong_calibration_changes_the_stated_uncertainty_only():
-    setups = [
-        pipeline_setup(load_profile("cubestar", overrides))
-        for overrides in ([], ["calibration.sigma=[0, 0, 0, 0, 0, 0, 0, 0, 0]"])
-    ]
-    calibrated, unknown = map(Pipeline, setups)
+    calibrated, unknown = (
+        EcssDevice(EcssPlan("cubestar", overrides))
+        for overrides in ((), ("calibration.sigma=[0, 0, 0, 0, 0, 0, 0, 0, 0]",))
+    )
     request = FrameRequest(
         0,
         TruthState(Attitude.from_radec_roll(83.8, -1.2, 0.0), ZERO_RATE),
         0.3,
         1.0,
-        settings=setups[0].settings,
+        settings=calibrated.settings,
     )
-    stated, noise = calibrated.handle(request), unknown.handle(request)
+    stated, noise = calibrated.pipeline.handle(request), unknown.pipeline.handle(request)
+    assert stated.valid
     assert stated.quaternion_xyzw == noise.quaternion_xyzw
     # where the calibration is taken for exact, its errors are taken for noise of the stars
     assert stated.sigma_cross_arcsec != noise.sigma_cross_arcsec

@@ -24,6 +24,7 @@ from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch.replay import replay
 from starhil.emulator.launch.unit_in_memory import links_of
+from starhil.emulator.links import base
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.sensor.pipeline.client import WorkerClient
@@ -536,3 +537,15 @@ def test_a_life_of_a_unit_without_telecommands_reads_it(tmp_path):
 def test_a_planted_defect_changes_what_runs(mutant):
     with mutant.planted():
         pass
+
+
+@pytest.mark.parametrize(
+    "name", ["every answer is sent twice", "requests that arrive together are answered in reverse"]
+)
+def test_a_planted_defect_leaves_the_tables_beside_it(name):
+    (mutant,) = (mutant for mutant in MUTANTS if mutant.name == name)
+    table = base.NEXT_PHASE
+    with mutant.planted():
+        assert (
+            base.NEXT_PHASE is table
+        )  # members of an enumeration that was defined again would not find its rows

@@ -431,6 +431,32 @@ def test_other_spot_widths_are_estimated(sigma: float) -> None:
     assert detections.psf_sigma_px == pytest.approx(sigma, rel=0.12)
 
 
+def test_spots_that_grow_towards_the_corners_have_right_errors_there() -> None:
+    """With one width for all stars, those in the corners stated too small an error, and too little light."""
+    shape, growth, sigma = (400, 400), 0.25, 0.9
+    known = DetectionSettings(gain_e_per_dn=GAIN, psf_growth=growth)
+    squares, light_errors, outside = [], [], []
+    for seed in range(5):
+        places = scattered(100, shape, seed, gap=20.0)
+        off2 = np.sum(np.square((places + 0.5) / 200.0 - 1.0), axis=1)
+        widths = sigma * (1.0 + growth * off2)
+        spots = (spot(shape, *place, 600.0, width) for place, width in zip(places, widths, strict=True))
+        found = detect(photograph(sum(spots), seed), known)
+        assert found.psf_sigma_px == pytest.approx(sigma * (1.0 + growth * 2.0 / 3.0), rel=0.05)
+        number, _ = matched(found, places)
+        seen = number[number >= 0]
+        assert len(seen) >= 95
+        error = (found.xy_px[seen] - places[number >= 0]) / found.xy_sigma_px[seen]
+        squares.append(np.mean(np.square(error), axis=1))
+        light_errors.append(found.flux[seen] / (600.0 * GAIN) - 1.0)
+        outside.append(off2[number >= 0] > 1.0)
+    z2, light, corner = np.concatenate(squares), np.concatenate(light_errors), np.concatenate(outside)
+    for part in (corner, ~corner):
+        assert z2[part].mean() == pytest.approx(1.0, abs=4.0 / math.sqrt(part.sum()))
+    sampling = math.hypot(*(light[part].std() / math.sqrt(part.sum()) for part in (corner, ~corner)))
+    assert light[corner].mean() == pytest.approx(light[~corner].mean(), abs=4.0 * sampling)
+
+
 def test_star_sizes_can_be_limited() -> None:
     shape = (200, 200)
     light = spot(shape, 50.0, 50.0, 40000.0) + spot(shape, 150.0, 150.0, 400.0)

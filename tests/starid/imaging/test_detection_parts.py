@@ -382,7 +382,7 @@ def test_spot_widths_have_no_bias(sigma: float) -> None:
         shares = [np.diff(0.5 * erf((edges - place) / (sigma * math.sqrt(2.0)))) for place in (y, x)]
         image = np.rint(50.0 + 8000.0 * np.outer(*shares) + rng.normal(0.0, 3.0, (61, 61))).astype(np.uint16)
         widths = np.empty(1)
-        if spot_widths(image, np.array([[30, 30]], np.int32), level, noise, 32.0, 0.9, 65535.0, widths):
+        if spot_widths(image, np.array([[30, 30]], np.int32), level, noise, 32.0, 0.9, 65535.0, 0.0, widths):
             errors.append(widths[0])
     assert len(errors) > 30
     assert np.median(errors) == pytest.approx(sigma, rel=0.02)

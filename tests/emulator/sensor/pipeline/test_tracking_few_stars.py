@@ -7,13 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from starhil.emulator.benchmarks.campaign import WRONG_DEG, block_side
 from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
 from starhil.emulator.sensor.pipeline.messages import FrameRequest, FrameResult
-from starhil.emulator.sensor.pipeline.pipeline import Pipeline
+from starhil.emulator.sensor.pipeline.pipeline import STARS_SENT, Pipeline
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
+from starid.identification.geometric.refinement import PRIOR_FREEDOM
 
 pytestmark = pytest.mark.long
 
@@ -31,9 +33,9 @@ def error_arcsec(result: FrameResult, truth: Attitude) -> float:
     return max(off.cross_boresight_arcsec, off.roll_arcsec)
 
 
-@pytest.mark.parametrize(("largest_deg", "share"), [(WRONG_DEG, 0.6), (0.4, 0.95)])
-def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch, largest_deg: float, share: float) -> None:
-    """The larger the error that may be left, the more frames have an attitude; none is off by more, however it was found."""
+@pytest.fixture
+def three_quarters_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hide three quarters of each image by a dark body."""
     expose = Pipeline._expose
 
     def hidden(self: Pipeline, request: FrameRequest):
@@ -42,8 +44,43 @@ def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch, largest_deg:
         return replace(exposure, image=dark)
 
     monkeypatch.setattr(Pipeline, "_expose", hidden)
+
+
+@pytest.mark.usefixtures("three_quarters_hidden")
+def test_an_attitude_that_may_be_off_by_more_than_the_limit_is_invalid() -> None:
+    """Four stars in a corner state 267″ about the boresight, and one such answer in six is off by more than 360″."""
+    limit_rad = math.radians(WRONG_DEG)
+    bare, open_ended = (
+        EcssDevice(EcssPlan("cubestar", ("device.tracking_stars=0", f"device.largest_error_deg={largest}")))
+        for largest in (WRONG_DEG, 10.0)
+    )
+    risky = 0
+    for number in range(FRAMES):
+        truth = random_attitude(np.random.default_rng((5, number)))
+        request = FrameRequest(
+            number, TruthState(truth, ZERO_RATE), bare.exposure_s, bare.gain, bare.settings
+        )
+        all_of_them, result = open_ended.pipeline.handle(request), bare.pipeline.handle(request)
+        assert isinstance(all_of_them, FrameResult)
+        assert isinstance(result, FrameResult)
+        if not all_of_them.valid:
+            assert not result.valid
+            continue
+        freedom = 2 * all_of_them.matched - 3 + PRIOR_FREEDOM
+        scale = math.sqrt(all_of_them.covariance_rad2[2][2] * (freedom - 2.0) / freedom)
+        risk = 2.0 * stats.t.sf(limit_rad / scale, freedom)
+        risky += risk > 1e-4
+        assert not (result.valid and risk > 1e-4)
+        assert result.valid or (result.reason == "too_few_stars" and risk > 1e-5)
+    assert risky > 0
+
+
+@pytest.mark.usefixtures("three_quarters_hidden")
+@pytest.mark.parametrize(("largest_deg", "share"), [(WRONG_DEG, 0.6), (0.4, 0.95)])
+def test_a_hidden_field_is_tracked(largest_deg: float, share: float) -> None:
+    """The larger the error that may be left, the more frames have an attitude; none is off by more, however it was found."""
     device, as_lost = (
-        EcssDevice(EcssPlan("cubestar", (f"device.tracking_error_deg={largest_deg}",))),
+        EcssDevice(EcssPlan("cubestar", (f"device.largest_error_deg={largest_deg}",))),
         EcssDevice(EcssPlan("cubestar", ("device.tracking_stars=0",))),
     )
     lost = tracked = 0
@@ -64,7 +101,7 @@ def test_a_hidden_field_is_tracked(monkeypatch: pytest.MonkeyPatch, largest_deg:
             assert error_arcsec(result, truth) < 3600.0 * largest_deg
         if result.valid:
             assert result.tracked
-            assert result.matched == len(result.stars)
+            assert len(result.stars) == min(result.matched, STARS_SENT)
         far = replace(guided, predicted=truth.rotated(np.radians(rng.uniform(-3.0, 3.0, 3))))
         answer = device.pipeline.handle(far)
         assert isinstance(answer, FrameResult)
