@@ -2,9 +2,12 @@
 
 import asyncio
 import json
+import socket
 import struct
-from contextlib import AsyncExitStack
+import time
+from contextlib import AsyncExitStack, suppress
 from dataclasses import replace
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -460,6 +463,42 @@ def test_pings_and_pongs_of_a_page_have_their_turns_like_requests(run, kind):
 
     options = replace(OPTIONS, console=replace(OPTIONS.console, view_token="look"))
     assert run(scenario, options=options) >= count * server.PAGE_TURN_S
+
+
+CHUNKS = b"POST /runs HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n" + b"1\r\nx\r\n" * 200_000
+"""A report of a stranger in chunks of a byte."""
+
+FRAGMENTS = (
+    b"GET /ws?token=look HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: MDAwMDAwMDAwMDAwMDAwMA==\r\n\r\n"
+    b"\x01\x80\0\0\0\0" + b"\x00\x80\0\0\0\0" * 200_000
+)
+"""A message of a page for viewing only in empty fragments."""
+
+
+@pytest.mark.parametrize("flood", [CHUNKS, FRAGMENTS], ids=["chunks", "fragments"])
+def test_what_a_peer_sends_in_small_parts_takes_a_small_turn_of_the_loop(run, flood):
+    """Parts of a byte are not requests, which have their turns: a flood of them held up replies on the bus by 0.2 s."""
+    turns = []
+
+    async def scenario(emulation, _line):
+        def send():
+            address = urlsplit(emulation.ready_fields["view"])
+            with (
+                suppress(OSError),  # it is closed, or read no further
+                socket.create_connection((address.hostname, address.port), timeout=0.5) as peer,
+            ):
+                peer.sendall(flood)
+
+        sending = asyncio.create_task(asyncio.to_thread(send))
+        while not sending.done():
+            before_s = time.thread_time()
+            await asyncio.sleep(0)
+            turns.append(time.thread_time() - before_s)
+        await sending
+
+    run(scenario, options=replace(OPTIONS, console=replace(OPTIONS.console, view_token="look")))
+    assert max(turns) < 0.05
 
 
 def test_a_page_that_comes_back_gets_the_rows_that_it_lacks_and_no_others(run):
