@@ -15,7 +15,14 @@ from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError
 from starhil.emulator.truth.json_lines import read_lines
 from starhil.emulator.truth.live import RESTART_S, LiveTruth
 from starhil.protocol.errors import reason
-from starhil.protocol.transports.connections import ConnectionLimit
+from starhil.protocol.transports.connections import (
+    Account,
+    Budget,
+    ConnectionLimit,
+    Listener,
+    listen,
+    stream_protocol,
+)
 
 log = logging.getLogger("starhil.truth")
 
@@ -79,6 +86,10 @@ MAX_LINES: Final = 32
 MAX_LINES_PER_S: Final = 2000.0
 """Most lines of datagrams per second, beyond a burst: the links of the device are served too."""
 
+USUAL_S: Final = 1.25e-4
+"""Processor time of a usual line, seconds; one that takes longer counts as several, so that all take at most a quarter of the
+loop."""
+
 BURST: Final = 200.0
 """Most lines of datagrams that may come at once."""
 
@@ -97,6 +108,14 @@ class _Datagrams(asyncio.DatagramProtocol):
         now_s = time.monotonic()
         self._room = min(self._room + (now_s - self._counted_s) * self._lines_per_s, BURST)
         self._counted_s = now_s
+        room, began_s = self._room, time.thread_time()
+        self._receive(data)
+        self._room = min(self._room, room - (time.thread_time() - began_s) / USUAL_S)
+
+    def _receive(self, data: bytes) -> None:
+        if self._room < 1.0:
+            self._feed.truth.reject(f"more than {self._lines_per_s:g} messages per second")
+            return
         lines = data.split(b"\n", MAX_LINES)
         for line in lines[:MAX_LINES]:
             if not line.strip():
@@ -128,7 +147,8 @@ class LiveFeed:
         self._now_s = now_s
         self._lock_step = None if step is None else LockStep(truth, now_s, step)
         self._transport: asyncio.DatagramTransport | None = None
-        self._server: asyncio.Server | None = None
+        self._server: Listener | None = None
+        self._budget = Budget()
         self._client: asyncio.Task[None] | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._limit = ConnectionLimit("truth feed")
@@ -151,15 +171,9 @@ class LiveFeed:
                 self._transport = transport
                 address = transport.get_extra_info("sockname")
             else:
-                self._server = await asyncio.start_server(
-                    until_cancelled(self._serve_connection),
-                    host,
-                    port,
-                    backlog=self._limit.size,
-                    start_serving=False,  # asyncio would lose a server whose start is cancelled
-                )
-                await self._server.start_serving()
-                address = self._server.sockets[0].getsockname()
+                serve = until_cancelled(self._serve_connection)
+                self._server = await listen(stream_protocol(serve), host, port, self._limit.size)
+                address = self._server.address
         return f"{protocol}:{address[0]}:{address[1]}"
 
     def receive(self, data: bytes) -> None:
@@ -208,14 +222,18 @@ class LiveFeed:
         if not self._limit.admits(writer.transport, len(self._writers)):
             return
         self._writers.add(writer)
+        message_format = self.truth.format
         try:
-            async for data in read_lines(reader, self.truth.format.max_size, self.truth.format.end):
-                if data is None:
-                    self.truth.reject(self._too_long())
-                else:
-                    async with self._turn:
-                        await self._answer(data, writer)
-                        await asyncio.sleep(0)
+            with Account(self._budget) as account:
+                async for data in read_lines(
+                    reader, message_format.max_size, message_format.end, account=account
+                ):
+                    if data is None:
+                        self.truth.reject(self._too_long())
+                    else:
+                        async with self._turn:
+                            await self._answer(data, writer)
+                            await asyncio.sleep(0)
         except ConnectionError:
             self.truth.reject("connection broken")
         finally:
