@@ -124,15 +124,16 @@ class _Datagrams:
         """Receive datagrams; return the address."""
         loop = asyncio.get_running_loop()
         (family, kind, protocol, _, address), *_ = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
-        self._socket = socket.socket(family, kind, protocol)
-        self._socket.settimeout(0.0)
+        source = socket.socket(family, kind, protocol)
         try:
-            self._socket.bind(address)
+            source.settimeout(0.0)
+            source.bind(address)
         except OSError:
-            self._socket.close()
+            source.close()
             raise
-        loop.add_reader(self._socket, self._read, self._socket)
-        own: tuple[Any, ...] = self._socket.getsockname()
+        self._socket = source
+        loop.add_reader(source, self._read, source)
+        own: tuple[Any, ...] = source.getsockname()
         return own
 
     def close(self) -> None:
