@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from starid.kernels.kernel_cache import sources_key
+from starid.kernels.kernel_cache import kernels_key
 from starid.storage.cache import kernel_folder
 
 _IMPORT: Final = re.compile(r"^(?:from|import)[ \t]+([\w.]+)(?:[ \t]+import[ \t]+(.+))?", re.MULTILINE)
@@ -22,7 +22,7 @@ class CompileProgress:
     def __init__(self, modules: Iterable[str]) -> None:
         self.kernels: Final = kernels_of(modules)
         """Names as numba gives them to their files: `module.function`."""
-        self._folder: Final = kernel_folder(sources_key())
+        self._folder: Final = kernel_folder(kernels_key())
 
     def compiled(self) -> int:
         """Return how many are in the cache."""

@@ -98,7 +98,6 @@ class ResultStore:
             ) from error
 
     def file(self, part: str) -> Path:
-        """Return the file of a part."""
         return self.folder / f"{part}.npz"
 
     def load(self, part: str) -> Results | None:
