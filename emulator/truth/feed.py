@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import socket
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.simulation.guard import until_cancelled
@@ -94,8 +96,20 @@ BURST: Final = 200.0
 """Most lines of datagrams that may come at once."""
 
 
-class _Datagrams(asyncio.DatagramProtocol):
-    """Passes each line of each datagram to the feed, unless they come too fast."""
+READ_AGAIN: Final = 20.0
+"""Number of lines for which there must be room before datagrams are read again; the kernel drops what does not fit its buffer."""
+
+MAX_STALE: Final = 1000
+"""Most datagrams that are dropped when reading is taken up again."""
+
+LONGEST_DATAGRAM: Final = 65536
+
+
+class _Datagrams:
+    """Passes each line of each datagram to the feed; if they come too fast, none is read for a while.
+
+    A datagram that is not read costs nothing; to receive and drop each one of a flood took half of the loop.
+    """
 
     def __init__(self, feed: LiveFeed, lines_per_s: float = MAX_LINES_PER_S) -> None:
         self._feed = feed
@@ -103,8 +117,57 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._room = BURST
         """Number of lines that may come now."""
         self._counted_s = time.monotonic()
+        self._socket: socket.socket | None = None
+        self._rest: asyncio.TimerHandle | None = None
 
-    def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002 (asyncio's signature)
+    async def listen(self, host: str, port: int) -> tuple[Any, ...]:
+        """Receive datagrams; return the address."""
+        loop = asyncio.get_running_loop()
+        (family, kind, protocol, _, address), *_ = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        source = socket.socket(family, kind, protocol)
+        try:
+            source.settimeout(0.0)
+            source.bind(address)
+        except OSError:
+            source.close()
+            raise
+        self._socket = source
+        loop.add_reader(source, self._read, source)
+        own: tuple[Any, ...] = source.getsockname()
+        return own
+
+    def close(self) -> None:
+        """Receive nothing more."""
+        if self._rest is not None:
+            self._rest.cancel()
+        if self._socket is not None:
+            asyncio.get_running_loop().remove_reader(self._socket)
+            self._socket.close()
+            self._socket = None
+
+    def _read(self, source: socket.socket) -> None:
+        with contextlib.suppress(OSError):  # nothing is there after all
+            self.datagram_received(source.recv(LONGEST_DATAGRAM))
+        if self._room < 1.0:
+            loop = asyncio.get_running_loop()
+            loop.remove_reader(source)
+            pause_s = (READ_AGAIN - self._room) / self._lines_per_s
+            self._rest = loop.call_later(pause_s, self._read_again, source)
+
+    def _read_again(self, source: socket.socket) -> None:
+        """Drop what has waited, which is stale, and read again."""
+        self._rest = None
+        with contextlib.suppress(OSError):  # nothing more is there
+            for _ in range(MAX_STALE):
+                source.recv(1)
+                self._reject()
+        asyncio.get_running_loop().add_reader(source, self._read, source)
+
+    def _reject(self) -> None:
+        self._feed.truth.reject(f"more than {self._lines_per_s:g} messages per second")
+
+    def datagram_received(self, data: bytes) -> None:
+        """Process a datagram."""
         now_s = time.monotonic()
         self._room = min(self._room + (now_s - self._counted_s) * self._lines_per_s, BURST)
         self._counted_s = now_s
@@ -114,14 +177,14 @@ class _Datagrams(asyncio.DatagramProtocol):
 
     def _receive(self, data: bytes) -> None:
         if self._room < 1.0:
-            self._feed.truth.reject(f"more than {self._lines_per_s:g} messages per second")
+            self._reject()
             return
         lines = data.split(b"\n", MAX_LINES)
         for line in lines[:MAX_LINES]:
             if not line.strip():
                 continue
             if self._room < 1.0:
-                self._feed.truth.reject(f"more than {self._lines_per_s:g} messages per second")
+                self._reject()
                 return
             self._room -= 1.0
             self._feed.receive(line)
@@ -146,7 +209,7 @@ class LiveFeed:
         self._on_message = on_message
         self._now_s = now_s
         self._lock_step = None if step is None else LockStep(truth, now_s, step)
-        self._transport: asyncio.DatagramTransport | None = None
+        self._datagrams: _Datagrams | None = None
         self._server: Listener | None = None
         self._budget = Budget()
         self._client: asyncio.Task[None] | None = None
@@ -155,21 +218,17 @@ class LiveFeed:
         self._turn = asyncio.Lock()
         """Held by the connection whose message is next: many do not take the loop together."""
 
-    async def start(self, socket: Socket, host: str, port: int) -> str:
+    async def start(self, kind: Socket, host: str, port: int) -> str:
         """Listen, or start connecting; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`."""
-        if socket == "connect":
+        if kind == "connect":
             self._client = asyncio.create_task(self._keep_connected(host, port))
             return f"tcp:{host}:{port}"
-        loop = asyncio.get_running_loop()
-        protocol = "udp" if socket == "udp" else "tcp"
+        protocol = "udp" if kind == "udp" else "tcp"
         what = f"truth feed {protocol}:{host}:{port}: cannot listen"
         with explained(what, "choose another port, or 0", errors=(OSError, ValueError)):
-            if socket == "udp":
-                transport, _ = await loop.create_datagram_endpoint(
-                    lambda: _Datagrams(self), local_addr=(host, port)
-                )
-                self._transport = transport
-                address = transport.get_extra_info("sockname")
+            if kind == "udp":
+                self._datagrams = _Datagrams(self)
+                address = await self._datagrams.listen(host, port)
             else:
                 serve = until_cancelled(self._serve_connection)
                 self._server = await listen(stream_protocol(serve), host, port, self._limit.size)
@@ -249,9 +308,9 @@ class LiveFeed:
 
     def close(self) -> None:
         """Stop listening and connecting."""
-        if self._transport is not None:
-            self._transport.close()
-            self._transport = None
+        if self._datagrams is not None:
+            self._datagrams.close()
+            self._datagrams = None
         if self._server is not None:
             self._server.close()
             self._server = None
