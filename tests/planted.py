@@ -120,13 +120,11 @@ def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
     """Give the functions of a module, and its constants, what a changed source has."""
     file = str(module.__file__)
     texts = source, Path(file).read_text(encoding="utf-8")
-    new, old = (_by_name(compile(text, file, "exec")) for text in texts)
+    new, old = (_by_name(_compiled(text, file)) for text in texts)
     undo, changes = ExitStack(), 0
-    gc.unfreeze()  # `starhil run`, in this process, hides its objects from the collector
-    for function in [item for item in gc.get_objects() if type(item) is types.FunctionType]:
+    for function in _functions(module):
         code = function.__code__
-        ours = function.__globals__ is vars(module) and code.co_filename == file  # not made by a decorator
-        if not ours or len(new[code.co_qualname]) != len(old[code.co_qualname]):
+        if len(new[code.co_qualname]) != len(old[code.co_qualname]):
             continue
         nth = [each.co_firstlineno for each in old[code.co_qualname]].index(code.co_firstlineno)
         changed = new[code.co_qualname][nth]
@@ -146,6 +144,23 @@ def _exchanged(module: types.ModuleType, source: str) -> Iterator[None]:
                 f"{module.__name__}: the change reaches no function and no constant that exists"
             )
         yield
+
+
+@functools.cache
+def _functions(module: types.ModuleType) -> list[types.FunctionType]:
+    """Return the functions that a module has made, wherever they are; what these make later is made from their code."""
+    gc.unfreeze()  # `starhil run`, in this process, hides its objects from the collector
+    functions = [each for each in gc.get_referrers(vars(module)) if type(each) is types.FunctionType]
+    return [
+        each
+        for each in functions  # not those that a decorator of another module has made
+        if each.__globals__ is vars(module) and each.__code__.co_filename == module.__file__
+    ]
+
+
+@functools.cache
+def _compiled(source: str, file: str) -> types.CodeType:
+    return compile(source, file, "exec")
 
 
 def _constants(module: types.ModuleType, source: str, old_source: str) -> dict[str, object]:

@@ -43,6 +43,7 @@ from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from tests.emulator.cli.command_line import run_command_line
+from tests.process.conftest import NO_IMAGES_OPTIONS
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.long
@@ -456,8 +457,6 @@ def walkthrough_page(heading: str, parts: set[str]) -> TypedPage:
     return typed_page([*start.text.splitlines(), *filtered], found)
 
 
-NO_IMAGES = ("--set", "run.worker=error_model")
-"""Frames on the bus are the same without images of the sky."""
 PAGES = {
     "README": readme_page(),
     "CAN": walkthrough_page(
@@ -487,7 +486,7 @@ def test_frames_that_a_page_types_are_answered_as_shown(name, tmp_path):
         typed = shlex.split(page.run.replace("vcan0", hub))
         assert typed[:2] == ["starhil", "run"]
         stack.enter_context(
-            EmulatorProcess(emulator_command(state_dir=tmp_path, extra=[*typed[2:], *NO_IMAGES]))
+            EmulatorProcess(emulator_command(state_dir=tmp_path, extra=[*typed[2:], *NO_IMAGES_OPTIONS]))
         )
         own = stack.enter_context(can.Bus(**python_can(hub)))
         for exchange in page.exchanges:

@@ -26,7 +26,8 @@ from starhil.emulator.cli import app as starhil
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from starid.cli import app as starid
 from tests.emulator.cli.command_line import run_command_line
-from tests.test_docs import NO_IMAGES, programs, run
+from tests.process.conftest import NO_IMAGES_OPTIONS
+from tests.test_docs import programs, run
 from tests.test_your_unit import written
 from tests.waiting import PATIENCE_S
 
@@ -205,7 +206,7 @@ class Shell:
         words = shlex.split(line, comments=True)
         if words[:2] == ["starhil", "run"]:
             self.end()
-            command = [installed_command(), *words[1:], *NO_IMAGES]
+            command = [installed_command(), *words[1:], *NO_IMAGES_OPTIONS]
             self._process = self._emulators.enter_context(EmulatorProcess(command))
             self.ready = self._process.ready
             return ""
@@ -329,7 +330,9 @@ def test_a_low_orbit_is_rendered_run_and_read(shell):
     shell.type(render)
     assert Path("leo.png").read_bytes().startswith(b"\x89PNG")
     for line in (run_, corrected):
-        shell.type(f"{line} --clock scaled:20 {' '.join(NO_IMAGES)}".replace("INT 30", "INT 12"), (0, 124))
+        shell.type(
+            f"{line} --clock scaled:20 {' '.join(NO_IMAGES_OPTIONS)}".replace("INT 30", "INT 12"), (0, 124)
+        )
     head, *rows = shell.type(cut).splitlines()
     assert head == "frame,valid,total_arcsec"
     assert rows

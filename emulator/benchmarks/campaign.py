@@ -28,7 +28,7 @@ from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Renderer
 from starid.arithmetic.arrays import Array
 from starid.attitude import Attitude, random_attitude
-from starid.camera import Camera
+from starid.camera import DEFAULT_FOV_DEG, Camera
 from starid.catalog import load_catalog
 from starid.identification.solution import Solution
 from starid.identification.star_identifier import StarIdentifier, make_identifier
@@ -77,7 +77,7 @@ class CampaignPlan:
 
     frames: int
     seed: int
-    fov_deg: float = 42.0
+    fov_deg: float = DEFAULT_FOV_DEG
     """Full width of the field of view, degrees."""
     rate_deg_s: float = 0.0
     """Body rate during the exposure, degrees per second about a random axis of each frame."""

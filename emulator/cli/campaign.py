@@ -17,6 +17,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import Jobs, OrbitChoice, Seed, Settings, names_of, with_orbit
+from starid.camera import DEFAULT_FOV_DEG
 from starid.cli.options import AsJson
 from starid.cli.output import Column, print_table
 from starid.storage.child_processes import importing_only_what_is_installed
@@ -224,7 +225,7 @@ class PlanOptions:
     ] = None
     orbit: OrbitChoice = None
     setting: Settings = None
-    fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0
+    fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = DEFAULT_FOV_DEG
     unknown_field: Annotated[
         bool,
         typer.Option("--unknown-field", help="Identify without knowing --fov, like `identify --fov auto`."),
@@ -329,7 +330,7 @@ def lost_in_space(
         plan = images.plan()
         with _backend(dask, jobs):
             chunks = list(_with_progress(run_campaign(plan, folder=output, jobs=jobs), plan.chunks))
-        figures |= summarise(np.concatenate(chunks), images.fov)
+        figures |= summarise(np.concatenate(chunks), plan.fov_deg)
     if as_json:
         print(json.dumps(figures))
     else:

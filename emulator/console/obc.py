@@ -232,7 +232,6 @@ def _step_lines(step: SentStep) -> list[str]:
 
 
 def toml(value: Value) -> str:
-    """Return a value as TOML."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, (int, float)):

@@ -29,7 +29,15 @@ from starhil.emulator.simulation.threads import in_thread
 from starhil.emulator.truth.json_lines import JsonError, parse_object
 from starhil.protocol.errors import escape_controls, reason
 from starhil.protocol.export import export
-from starhil.protocol.transports.connections import WINDOW, ConnectionLimit, detect_lost_peer
+from starhil.protocol.transports.connections import (
+    WINDOW,
+    Budget,
+    ConnectionLimit,
+    Gate,
+    Listener,
+    detect_lost_peer,
+    listen,
+)
 
 log = logging.getLogger("starhil.console")
 
@@ -120,7 +128,7 @@ class ConsoleServer:
         self._files: dict[str, tuple[bytes, str]] = {}
         """Files of the page that have been read: compressed, and their tag."""
         self._runner: web.AppRunner | None = None
-        self._listener: asyncio.Server | None = None
+        self._listener: Listener | None = None
 
     async def start(self, where: str) -> dict[str, str]:
         """Listen on `auto` (loopback interface, a free port) or HOST:PORT; return the addresses of the page.
@@ -153,16 +161,22 @@ class ConsoleServer:
         )
         await self._runner.setup()
         server, limit = cast("web.Server", self._runner.server), ConnectionLimit("console", BUSY)
+        budget = Budget()
+
+        def admits(transport: asyncio.BaseTransport) -> bool:
+            admitted = limit.admits(transport, len(server.connections))
+            if admitted:
+                detect_lost_peer(transport, must_read=True)
+            return admitted
+
         try:
-            self._listener = await asyncio.get_running_loop().create_server(
-                lambda: _Gate(server, limit), host, port, backlog=limit.size
-            )
+            self._listener = await listen(lambda: Gate(budget, server, admits), host, port, limit.size)
         except (OSError, UnicodeError) as error:
             await self.close()
             raise EmulatorError(
                 f"--view {where}: cannot listen ({reason(error)}); choose another port, or auto"
             ) from None
-        bound = self._listener.sockets[0].getsockname()
+        bound = self._listener.address
         name = f"[{bound[0]}]" if ":" in bound[0] else bound[0]
         page = f"http://{name}:{bound[1]}/?token="
         only = {"view_only": page + quote(self._view_token, safe="")} if self._view_token else {}
@@ -388,22 +402,6 @@ class _ServerLog(logging.LoggerAdapter[logging.Logger]):
             error = sys.exception()
         from_peer = isinstance(error, (HttpProcessingError, web.RequestPayloadError))
         super().log(logging.DEBUG if from_peer else level, msg, *args, **options)
-
-
-class _Gate(asyncio.Protocol):
-    """Passes a new connection to the HTTP server unless there are too many."""
-
-    def __init__(self, server: web.Server, limit: ConnectionLimit) -> None:
-        self._server = server
-        self._limit = limit
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Replace this protocol by one of the server."""
-        if self._limit.admits(transport, len(self._server.connections)):
-            detect_lost_peer(transport, must_read=True)
-            protocol = self._server()
-            transport.set_protocol(protocol)
-            protocol.connection_made(transport)
 
 
 async def _pump(viewer: Viewer, socket: web.WebSocketResponse) -> None:

@@ -47,7 +47,15 @@ from starhil.emulator.truth.live import LiveTruth
 from starhil.protocol.errors import ProtocolError, did_you_mean, remedy
 from starhil.protocol.files.validation import problems
 from starhil.protocol.icd.conventions import NANOSECONDS
-from starhil.protocol.transports.connections import ConnectionLimit, detect_lost_peer
+from starhil.protocol.transports.connections import (
+    Account,
+    Budget,
+    ConnectionLimit,
+    Listener,
+    detect_lost_peer,
+    listen,
+    stream_protocol,
+)
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
@@ -96,7 +104,8 @@ class ControlServer:
         self._opening: asyncio.Task[Any] | None = None
         """The last request for which files are read."""
         self._quit = quit_run
-        self._server: asyncio.Server | None = None
+        self._server: asyncio.Server | Listener | None = None
+        self._budget = Budget()
         self._peers: dict[asyncio.StreamWriter, bool] = {}
         """Connections, the oldest first, and whether one of their requests was accepted."""
         self._limit = ConnectionLimit("control channel", BUSY_ANSWER)
@@ -135,8 +144,8 @@ class ControlServer:
         what = f"control channel {where}: cannot listen"
         with explained(what, "choose another port, or auto", errors=(OSError, ValueError)):
             serve = until_cancelled(self._serve_connection)
-            self._server = await asyncio.start_server(serve, host, int(port), backlog=self._limit.size)
-        address = self._server.sockets[0].getsockname()
+            self._server = await listen(stream_protocol(serve), host, int(port), self._limit.size)
+        address = self._server.address
         return f"{address[0]}:{address[1]}"
 
     def close(self) -> None:
@@ -156,15 +165,16 @@ class ControlServer:
         if self._socket is None:
             detect_lost_peer(writer.transport, must_read=True)
         try:
-            async for line in read_lines(reader, MAX_LINE, within_s=REQUEST_S):
-                if self._token and not self._peers.get(writer):
-                    async with self._stranger:
-                        await asyncio.sleep(STRANGER_TURN_S)
-                answer = await self.answer(line)
-                if writer in self._peers:
-                    self._peers[writer] |= answer["ok"]
-                writer.write(json.dumps(answer).encode() + b"\n")
-                await writer.drain()
+            with Account(self._budget) as account:
+                async for line in read_lines(reader, MAX_LINE, account=account, within_s=REQUEST_S):
+                    if self._token and not self._peers.get(writer):
+                        async with self._stranger:
+                            await asyncio.sleep(STRANGER_TURN_S)
+                    answer = await self.answer(line)
+                    if writer in self._peers:
+                        self._peers[writer] |= answer["ok"]
+                    writer.write(json.dumps(answer).encode() + b"\n")
+                    await writer.drain()
         except ConnectionError as error:
             log.info("control channel: connection lost (%s)", error)
         except TimeoutError:

@@ -38,7 +38,6 @@ class Counters:
     """Number of faults of each kind, for the log and the control channel."""
 
     def with_telecommand(self) -> Counters:
-        """Count a telecommand."""
         return Counters((self.telecommands + 1) & 0xFFFF, self.telemetry, self.flags, self.faults)
 
     def with_telemetry(self) -> Counters:

@@ -41,7 +41,6 @@ def memory_format(definition: Parameter) -> str:
 
 
 def memory_bits(definition: Parameter) -> int:
-    """Return the number of bits of a parameter in memory."""
     return 8 * struct.calcsize(memory_format(definition))
 
 
@@ -204,7 +203,6 @@ class Parameters(Mapping[str, ParameterValue]):
         return [name for name in stored if name not in accepted]
 
     def mark_stored(self, stored: Mapping[str, ParameterValue]) -> None:
-        """Record the stored values."""
         self.state = replace(self.state, stored=MappingProxyType(dict(stored)))
 
     def _checked(

@@ -77,12 +77,10 @@ class PowerModel:
         return Phase.IMAGER_ON
 
     def current_a(self, phase: Phase) -> float:
-        """Return the current in a phase, amperes."""
         milliamperes: float = getattr(self.config, f"{phase}_ma")
         return milliamperes * MILLI
 
     def power_w(self, phase: Phase) -> float:
-        """Return the power in a phase, watts."""
         return self.current_a(phase) * self.config.voltage_v
 
     def mean_power_w(self, timing: FrameTiming) -> float:

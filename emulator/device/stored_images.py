@@ -49,12 +49,10 @@ class StoredImage:
 
     @property
     def file_size(self) -> int:
-        """Size of the file, bytes."""
         return BMP_HEAD.size + len(PALETTE) + len(self.pixels)
 
     @cached_property
     def file_crc(self) -> int:
-        """Checksum of the file."""
         return file_checksum(self.content())
 
     def content(self) -> bytes:
@@ -86,16 +84,13 @@ class JpgFile:
 
     @property
     def file_size(self) -> int:
-        """Size of the file, bytes."""
         return len(self.data)
 
     @cached_property
     def file_crc(self) -> int:
-        """Checksum of the file."""
         return file_checksum(self.data)
 
     def content(self) -> bytes:
-        """Return the file."""
         return self.data
 
 

@@ -45,7 +45,6 @@ class ObcRequests:
     _loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop, repr=False)
 
     def count(self) -> None:
-        """Count a request."""
         self.requests += 1
         self.last_s = self._loop.time()
 

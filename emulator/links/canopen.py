@@ -89,7 +89,6 @@ class DeviceSample:
         self._hits = hits
 
     def telemetry(self, row: Row) -> bytes:
-        """Return the bytes of a telemetry row."""
         hits = self._hits[row.name] = self._requests.faults.hits(row, self._shot)
         try:
             return self._requests.telemetry(row.name, self._shot, hits)

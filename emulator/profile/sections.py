@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from starhil.emulator.simulation.config_model import Date, Strict, UserPath
 from starhil.emulator.truth.config import InProfileFolder, profile_paths
 from starid.arithmetic.elementary import square
+from starid.camera import DEFAULT_FOV_DEG
 
 FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
 """Duration of one stage of a frame, seconds."""
@@ -90,7 +91,7 @@ class CameraConfig(Strict):
         if "focal_px" in values:
             values.setdefault("centre_px", [(self.width - 1) / 2, (self.height - 1) / 2])
         else:
-            values.setdefault("fov_deg", 42.0)
+            values.setdefault("fov_deg", DEFAULT_FOV_DEG)
         return values
 
 

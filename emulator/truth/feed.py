@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
+import socket
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.simulation.guard import until_cancelled
@@ -15,7 +17,14 @@ from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError
 from starhil.emulator.truth.json_lines import read_lines
 from starhil.emulator.truth.live import RESTART_S, LiveTruth
 from starhil.protocol.errors import reason
-from starhil.protocol.transports.connections import ConnectionLimit
+from starhil.protocol.transports.connections import (
+    Account,
+    Budget,
+    ConnectionLimit,
+    Listener,
+    listen,
+    stream_protocol,
+)
 
 log = logging.getLogger("starhil.truth")
 
@@ -79,12 +88,28 @@ MAX_LINES: Final = 32
 MAX_LINES_PER_S: Final = 2000.0
 """Most lines of datagrams per second, beyond a burst: the links of the device are served too."""
 
+USUAL_S: Final = 1.25e-4
+"""Processor time of a usual line, seconds; one that takes longer counts as several, so that all take at most a quarter of the
+loop."""
+
 BURST: Final = 200.0
 """Most lines of datagrams that may come at once."""
 
 
-class _Datagrams(asyncio.DatagramProtocol):
-    """Passes each line of each datagram to the feed, unless they come too fast."""
+READ_AGAIN: Final = 20.0
+"""Number of lines for which there must be room before datagrams are read again; the kernel drops what does not fit its buffer."""
+
+MAX_STALE: Final = 1000
+"""Most datagrams that are dropped when reading is taken up again."""
+
+LONGEST_DATAGRAM: Final = 65536
+
+
+class _Datagrams:
+    """Passes each line of each datagram to the feed; if they come too fast, none is read for a while.
+
+    A datagram that is not read costs nothing; to receive and drop each one of a flood took half of the loop.
+    """
 
     def __init__(self, feed: LiveFeed, lines_per_s: float = MAX_LINES_PER_S) -> None:
         self._feed = feed
@@ -92,17 +117,74 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._room = BURST
         """Number of lines that may come now."""
         self._counted_s = time.monotonic()
+        self._socket: socket.socket | None = None
+        self._rest: asyncio.TimerHandle | None = None
 
-    def datagram_received(self, data: bytes, addr: object) -> None:  # noqa: ARG002 (asyncio's signature)
+    async def listen(self, host: str, port: int) -> tuple[Any, ...]:
+        """Receive datagrams; return the address."""
+        loop = asyncio.get_running_loop()
+        (family, kind, protocol, _, address), *_ = await loop.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+        source = socket.socket(family, kind, protocol)
+        try:
+            source.settimeout(0.0)
+            source.bind(address)
+        except OSError:
+            source.close()
+            raise
+        self._socket = source
+        loop.add_reader(source, self._read, source)
+        own: tuple[Any, ...] = source.getsockname()
+        return own
+
+    def close(self) -> None:
+        """Receive nothing more."""
+        if self._rest is not None:
+            self._rest.cancel()
+        if self._socket is not None:
+            asyncio.get_running_loop().remove_reader(self._socket)
+            self._socket.close()
+            self._socket = None
+
+    def _read(self, source: socket.socket) -> None:
+        with contextlib.suppress(OSError):  # nothing is there after all
+            self.datagram_received(source.recv(LONGEST_DATAGRAM))
+        if self._room < 1.0:
+            loop = asyncio.get_running_loop()
+            loop.remove_reader(source)
+            pause_s = (READ_AGAIN - self._room) / self._lines_per_s
+            self._rest = loop.call_later(pause_s, self._read_again, source)
+
+    def _read_again(self, source: socket.socket) -> None:
+        """Drop what has waited, which is stale, and read again."""
+        self._rest = None
+        with contextlib.suppress(OSError):  # nothing more is there
+            for _ in range(MAX_STALE):
+                source.recv(1)
+                self._reject()
+        asyncio.get_running_loop().add_reader(source, self._read, source)
+
+    def _reject(self) -> None:
+        self._feed.truth.reject(f"more than {self._lines_per_s:g} messages per second")
+
+    def datagram_received(self, data: bytes) -> None:
+        """Process a datagram."""
         now_s = time.monotonic()
         self._room = min(self._room + (now_s - self._counted_s) * self._lines_per_s, BURST)
         self._counted_s = now_s
+        room, began_s = self._room, time.thread_time()
+        self._receive(data)
+        self._room = min(self._room, room - (time.thread_time() - began_s) / USUAL_S)
+
+    def _receive(self, data: bytes) -> None:
+        if self._room < 1.0:
+            self._reject()
+            return
         lines = data.split(b"\n", MAX_LINES)
         for line in lines[:MAX_LINES]:
             if not line.strip():
                 continue
             if self._room < 1.0:
-                self._feed.truth.reject(f"more than {self._lines_per_s:g} messages per second")
+                self._reject()
                 return
             self._room -= 1.0
             self._feed.receive(line)
@@ -127,39 +209,30 @@ class LiveFeed:
         self._on_message = on_message
         self._now_s = now_s
         self._lock_step = None if step is None else LockStep(truth, now_s, step)
-        self._transport: asyncio.DatagramTransport | None = None
-        self._server: asyncio.Server | None = None
+        self._datagrams: _Datagrams | None = None
+        self._server: Listener | None = None
+        self._budget = Budget()
         self._client: asyncio.Task[None] | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._limit = ConnectionLimit("truth feed")
         self._turn = asyncio.Lock()
         """Held by the connection whose message is next: many do not take the loop together."""
 
-    async def start(self, socket: Socket, host: str, port: int) -> str:
+    async def start(self, kind: Socket, host: str, port: int) -> str:
         """Listen, or start connecting; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`."""
-        if socket == "connect":
+        if kind == "connect":
             self._client = asyncio.create_task(self._keep_connected(host, port))
             return f"tcp:{host}:{port}"
-        loop = asyncio.get_running_loop()
-        protocol = "udp" if socket == "udp" else "tcp"
+        protocol = "udp" if kind == "udp" else "tcp"
         what = f"truth feed {protocol}:{host}:{port}: cannot listen"
         with explained(what, "choose another port, or 0", errors=(OSError, ValueError)):
-            if socket == "udp":
-                transport, _ = await loop.create_datagram_endpoint(
-                    lambda: _Datagrams(self), local_addr=(host, port)
-                )
-                self._transport = transport
-                address = transport.get_extra_info("sockname")
+            if kind == "udp":
+                self._datagrams = _Datagrams(self)
+                address = await self._datagrams.listen(host, port)
             else:
-                self._server = await asyncio.start_server(
-                    until_cancelled(self._serve_connection),
-                    host,
-                    port,
-                    backlog=self._limit.size,
-                    start_serving=False,  # asyncio would lose a server whose start is cancelled
-                )
-                await self._server.start_serving()
-                address = self._server.sockets[0].getsockname()
+                serve = until_cancelled(self._serve_connection)
+                self._server = await listen(stream_protocol(serve), host, port, self._limit.size)
+                address = self._server.address
         return f"{protocol}:{address[0]}:{address[1]}"
 
     def receive(self, data: bytes) -> None:
@@ -208,14 +281,18 @@ class LiveFeed:
         if not self._limit.admits(writer.transport, len(self._writers)):
             return
         self._writers.add(writer)
+        message_format = self.truth.format
         try:
-            async for data in read_lines(reader, self.truth.format.max_size, self.truth.format.end):
-                if data is None:
-                    self.truth.reject(self._too_long())
-                else:
-                    async with self._turn:
-                        await self._answer(data, writer)
-                        await asyncio.sleep(0)
+            with Account(self._budget) as account:
+                async for data in read_lines(
+                    reader, message_format.max_size, message_format.end, account=account
+                ):
+                    if data is None:
+                        self.truth.reject(self._too_long())
+                    else:
+                        async with self._turn:
+                            await self._answer(data, writer)
+                            await asyncio.sleep(0)
         except ConnectionError:
             self.truth.reject("connection broken")
         finally:
@@ -231,9 +308,9 @@ class LiveFeed:
 
     def close(self) -> None:
         """Stop listening and connecting."""
-        if self._transport is not None:
-            self._transport.close()
-            self._transport = None
+        if self._datagrams is not None:
+            self._datagrams.close()
+            self._datagrams = None
         if self._server is not None:
             self._server.close()
             self._server = None

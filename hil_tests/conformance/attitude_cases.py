@@ -54,7 +54,6 @@ class AttitudeRow:
 
     @property
     def title(self) -> str:
-        """Title of the case."""
         return f"{self.row.name} has one attitude in all forms if it is valid, and the true one"
 
     def is_valid(self, values: Mapping[str, Value]) -> bool:

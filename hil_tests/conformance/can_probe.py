@@ -42,7 +42,6 @@ class CanProbe(LinkProbe):
             self.send(CanFrame(can_id, data))
 
     def send(self, frame: CanFrame) -> None:
-        """Send a raw frame."""
         self.log.append(f"{self.now():.4f} -> {frame!s}")
         self.port.send(frame)
 

@@ -211,7 +211,6 @@ class CanopenProbe(Probe):
         self.send_frame(CanFrame(can_id, payload, extended=extended, remote=remote))
 
     def send_frame(self, frame: CanFrame) -> None:
-        """Send a frame as it is."""
         self.log.append(f"{self.now():.4f} -> {frame!s}")
         self.port.send(frame)
 
@@ -542,7 +541,6 @@ def encoded(item: ODVariable, number: int) -> bytes:
 
 
 def is_integer(item: ODVariable) -> bool:
-    """Return whether a variable is an integer."""
     return item.data_type in datatypes.INTEGER_TYPES
 
 

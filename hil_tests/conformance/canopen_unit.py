@@ -50,7 +50,6 @@ Run = Callable[[CanopenProbe], None]
 
 
 def canopen_unit_cases(unit: Unit) -> list[Case[CanopenProbe]]:
-    """Return the cases for a unit with CANopen."""
     layout = unit.canopen
     found = list(entries(unit, layout))
     cases = [*_rows(unit, found), *_commands(found), *_records(found), *_limits(found), *_pdos(layout, found)]

@@ -159,7 +159,6 @@ class CaseArea(Generic[ProbeType]):
 
 
 def clause_of(row: Row) -> str:
-    """Return the source of a row."""
     return f"{row.kind} {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
 
 

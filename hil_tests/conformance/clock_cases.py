@@ -74,7 +74,6 @@ class Time:
         return max(min(2.0 * item.resolution * _seconds(item) for item in self.fields), 1e-6)
 
     def seconds(self, seen: Mapping[str, Value]) -> float:
-        """Return the time, s."""
         return sum(float(seen[item.name]) * _seconds(item) for item in self.fields)
 
     def passed(self, before: Mapping[str, Value], after: Mapping[str, Value], epoch: str) -> float:
@@ -106,7 +105,6 @@ def times_of(row: Row) -> Iterator[Time]:
 
 
 def counts_of(row: Row, quantities: Mapping[str, object] | frozenset[str]) -> list[Field]:
-    """Return the counts in a row."""
     return [item for item in row.named.values() if item.quantity in quantities and item.kind == "integer"]
 
 

@@ -77,7 +77,6 @@ class ReadableSettings:
         self._found: list[tuple[Row, dict[str, Value]]] = []
 
     def prepare(self, probe: LinkProbe) -> None:
-        """Record the settings."""
         kept = SETTING_ACTIONS.union(probe.unit.plugin.actions if probe.unit.plugin is not None else ())
         for command, row, places in probe.unit.reported:
             if command.action in kept and not changes_link(probe.unit, command):
@@ -85,7 +84,6 @@ class ReadableSettings:
                 self._found.append((command, {name: seen[place] for name, place in places.items()}))
 
     def restore(self, probe: LinkProbe) -> None:
-        """Restore the settings."""
         for command, values in self._found:
             probe.command(command.name, **values)
 
@@ -198,7 +196,6 @@ class LinkProbe(Probe):
         """Store the next input; return whether anything arrived in time."""
 
     def answers(self, row: Row) -> Sequence[str]:
-        """Return the answers of a row on this link."""
         return row.answers
 
     def can_refuse(self, message_class: str) -> bool:  # noqa: ARG002 -- for links on which it depends
@@ -223,7 +220,6 @@ class LinkProbe(Probe):
     # --- requests ---
 
     def telecommands(self) -> Iterable[Row]:
-        """Return the telecommands of the unit."""
         return self.unit.telecommands.values()
 
     def telemetry_rows(self) -> Iterable[Row]:

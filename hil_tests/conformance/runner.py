@@ -41,7 +41,6 @@ class Outcome:
 
     @classmethod
     def of(cls, case: Case[Any], ending: Ending, seconds: float = 0.0, log: Sequence[str] = ()) -> Outcome:
-        """Return the outcome of a case."""
         match ending:
             case CaseFailed():
                 result = FAILED, ending.expected, ending.seen

@@ -59,7 +59,6 @@ class SerialProbe(LinkProbe):
     # --- the line ---
 
     def send(self, data: bytes) -> None:
-        """Send raw bytes."""
         self._note("->", data)
         self.sent = data
         self.port.send(data)

@@ -47,7 +47,6 @@ def upload_request(index: int, subindex: int) -> bytes:
 
 
 def abort_code(response: bytes) -> int:
-    """Return the code of an abort."""
     return int.from_bytes(response[4:], "little")
 
 

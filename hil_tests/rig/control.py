@@ -123,7 +123,6 @@ class ControlClient:
             time.sleep(POLL_S)
 
     def close(self) -> None:
-        """Close the channel."""
         self._lines.close()
         self._socket.close()
 

@@ -36,7 +36,6 @@ class StepResult:
     """Numbers that the step computed, such as the attitude error."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as JSON data."""
         values = {
             key: value.hex() if isinstance(value, bytes) else value for key, value in self.values.items()
         }
@@ -73,7 +72,6 @@ class SessionResult:
         return self.interruption is None and self.count(FAILED) == 0 and self.count(PASSED) > 0
 
     def to_json(self) -> dict[str, Any]:
-        """Return the result as JSON data."""
         return {
             "title": self.title,
             "passed": self.passed,
@@ -93,7 +91,6 @@ def summarize(values: Mapping[str, Value]) -> str:
 
 
 def junit_cases(result: SessionResult, suite: str) -> list[TestCase]:
-    """Return the steps of a session as JUnit cases."""
     return [
         TestCase(
             suite,

@@ -94,7 +94,6 @@ class Field(FieldKeys):
 
     @property
     def type(self) -> str:
-        """Type of the slot."""
         return self.slot.type
 
     @property

@@ -61,7 +61,6 @@ def one_line(text: str) -> str:
 
 
 def ascii_line(text: str) -> str:
-    """Return text as one line of ASCII."""
     return one_line(text).translate(_ASCII).encode("ascii", errors="replace").decode("ascii")
 
 
@@ -131,7 +130,6 @@ def ruby_string(text: str) -> str:
 
 
 def xtce_name(text: str) -> str:
-    """Return text as a name in XTCE."""
     return re.sub(r"[./:\[\] ]", "_", one_line(text)) or "_"
 
 

@@ -1,17 +1,21 @@
-"""Fair sharing of an event loop by many connections, a limit of their number, and socket options for TCP.
+"""What peers without trust may take of an event loop: a budget of its time, turns, a limit of connections; and socket options for TCP.
 
-Each connection reads a bounded amount per turn of the loop. Without a limit on their number, connections could use up all
-file descriptors of the process, and links could not be reopened.
+Each server has a `Budget`, accepts connections by `listen`, and passes what they send through a `Gate`, or counts its own
+processing with an `Account`. Without a limit on their number, connections could use up all file descriptors of the process,
+and links could not be reopened.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import resource
 import socket
+import time
 from abc import abstractmethod
-from typing import Final, cast
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Final, Self, cast
 
 log: Final = logging.getLogger("starhil.connections")
 
@@ -34,6 +38,100 @@ MAX_CONNECTIONS: Final = 64
 
 SHARE_OF_DESCRIPTORS: Final = 8
 """A server uses at most one in this many of the file descriptors that the process may open."""
+
+
+LEAST_TURN: Final = 256
+"""Number of bytes that is read from a connection at a time when many send much."""
+
+FREE_SHARE: Final = 0.02
+"""Share of the loop that a connection may take without rests: on the hub, 200 frames per second."""
+
+FREE_IN_ALL: Final = 0.3
+"""Share of the loop that all connections of a server together may take without rests."""
+
+LEAST_TAKEN_S: Final = 0.001
+"""Processor time beyond the free share after which a connection rests, seconds."""
+
+REST: Final = 3.0
+"""Length of a rest: this many times what the connection has taken. Connections that rest do so one after another, so that all
+those of a server together leave three quarters of the loop to the links."""
+
+ACCEPTING_S: Final = 0.005
+"""Shortest time between two connections that a server accepts, seconds: each costs the loop some 0.2 ms."""
+
+REFUSED_S: Final = 1.0
+"""Pause after a connection that could not be accepted, seconds: the process has no free file descriptor."""
+
+
+class Budget:
+    """The time of the event loop that the connections of a server may take, and the order of their rests."""
+
+    def __init__(self) -> None:
+        self.accounts = 0
+        """Number of connections."""
+        self.resting = 0
+        """Number of connections from which nothing is read for now."""
+        self.rested_s = 0.0
+        """Time of the loop at which the last of them has rested, seconds."""
+
+    @property
+    def read_size(self) -> int:
+        """Number of bytes to read from a connection at a time: the fewer, the more there are that may send at once."""
+        return max(TURN // (1 + max(self.resting, self.accounts // 4)), LEAST_TURN)
+
+
+class Account:
+    """The time of the loop that a connection has taken from its server's budget; `with` it while the connection is open."""
+
+    def __init__(self, budget: Budget) -> None:
+        self.budget = budget
+        self._taken_s = 0.0
+        """Processor time beyond the free share, seconds."""
+        self._longest_s = 0.0
+        self._counted_s = 0.0
+
+    def __enter__(self) -> Self:
+        self.budget.accounts += 1
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.budget.accounts -= 1
+
+    @contextlib.contextmanager
+    def taking(self) -> Iterator[None]:
+        """Count the time of what is done inside, which must not await."""
+        loop = asyncio.get_running_loop()
+        begin_s, began_s = loop.time(), time.thread_time()
+        try:
+            yield
+        finally:
+            now_s = loop.time()
+            free = min(FREE_SHARE, FREE_IN_ALL / max(self.budget.accounts, 1))
+            self._taken_s = max(self._taken_s - free * (now_s - self._counted_s), 0.0)
+            self._taken_s += time.thread_time() - began_s
+            self._longest_s = now_s - begin_s  # longer where other processes have the processor
+            self._counted_s = now_s
+
+    def rests_until_s(self) -> float | None:
+        """Begin a rest if it is due, behind those that rest already; return its end in time of the loop, seconds."""
+        if self._taken_s <= LEAST_TAKEN_S:
+            return None
+        now_s, taken_s = asyncio.get_running_loop().time(), max(self._taken_s, self._longest_s)
+        self._taken_s = 0.0
+        self.budget.rested_s = max(self.budget.rested_s, now_s) + REST * taken_s
+        return self.budget.rested_s
+
+    async def rest(self) -> None:
+        """Let other tasks run, and rest if it is due."""
+        until_s = self.rests_until_s()
+        if until_s is None:
+            await asyncio.sleep(0)
+            return
+        self.budget.resting += 1
+        try:
+            await asyncio.sleep(until_s - asyncio.get_running_loop().time())
+        finally:
+            self.budget.resting -= 1
 
 
 class ConnectionLimit:
@@ -84,6 +182,156 @@ class TurnProtocol(asyncio.BufferedProtocol):
     @abstractmethod
     def data_received(self, data: bytes) -> None:
         """Process bytes that were read."""
+
+
+class Gate(TurnProtocol):
+    """Passes what a connection sends to a protocol, in turns and within the budget of its server.
+
+    Parameters
+    ----------
+    budget
+        That of the server.
+    make
+        Makes the protocol of a connection that is admitted.
+    admits
+        Whether a new connection is admitted; it closes one that is not.
+    """
+
+    _transport: asyncio.Transport
+
+    def __init__(
+        self,
+        budget: Budget,
+        make: Callable[[], asyncio.BaseProtocol],
+        admits: Callable[[asyncio.BaseTransport], bool],
+    ) -> None:
+        self._make = make
+        self._admits = admits
+        self._account = Account(budget)
+        self._protocol = asyncio.Protocol()  # which ignores everything
+        self._rest: asyncio.TimerHandle | None = None
+        """Its end, while nothing is read."""
+        self._paused = False
+        """Whether reading was paused for the rest, and not by the protocol."""
+        self._held = b""
+        """What came in a rest because the protocol had resumed reading."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._transport = cast("asyncio.Transport", transport)
+        self._account.__enter__()
+        if self._admits(transport):
+            self._protocol = cast("asyncio.Protocol", self._make())
+            self._protocol.connection_made(transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._account.__exit__()
+        if self._rest is not None:
+            self._rest.cancel()
+            self._account.budget.resting -= 1
+        self._protocol.connection_lost(exc)
+
+    def eof_received(self) -> bool | None:
+        return self._protocol.eof_received()
+
+    def pause_writing(self) -> None:
+        self._protocol.pause_writing()
+
+    def resume_writing(self) -> None:
+        self._protocol.resume_writing()
+
+    def get_buffer(self, sizehint: int) -> bytearray:
+        self.read_size = self._account.budget.read_size
+        return super().get_buffer(sizehint)
+
+    def data_received(self, data: bytes) -> None:
+        """Pass on what was read; a connection that takes much of the loop then rests, behind those that rest already."""
+        if self._rest is not None:
+            self._held += data
+            self._pause()
+            return
+        with self._account.taking():
+            self._protocol.data_received(data)
+        until_s = self._account.rests_until_s()
+        if until_s is not None and not self._transport.is_closing():
+            self._account.budget.resting += 1
+            self._rest = asyncio.get_running_loop().call_at(until_s, self._end_rest)
+            if self._transport.is_reading():
+                self._pause()
+
+    def _pause(self) -> None:
+        self._transport.pause_reading()
+        self._paused = True
+
+    def _end_rest(self) -> None:
+        self._rest = None
+        self._account.budget.resting -= 1
+        if self._transport.is_closing():
+            return
+        if self._paused:
+            self._paused = False
+            self._transport.resume_reading()
+        if self._held:
+            data, self._held = self._held, b""
+            self.data_received(data)
+
+
+class Listener:
+    """A TCP server that accepts connections one by one, with a pause: a flood of them takes a small share of the loop."""
+
+    def __init__(
+        self, server: asyncio.Server, backlog: int, make: Callable[[], asyncio.BaseProtocol]
+    ) -> None:
+        self._server = server
+        self._make = make
+        self.address = server.sockets[0].getsockname()
+        """Address of the first socket."""
+        self._sockets = [each.dup() for each in server.sockets]
+        for each in self._sockets:
+            each.listen(backlog)
+        self._tasks = [asyncio.create_task(self._accept(each)) for each in self._sockets]
+
+    async def _accept(self, listening: socket.socket) -> None:
+        loop = asyncio.get_running_loop()
+        while True:
+            try:
+                connection, _ = await loop.sock_accept(listening)
+                await loop.connect_accepted_socket(self._make, connection)
+            except ConnectionError:  # it has closed already
+                pass
+            except OSError as error:
+                loop.call_exception_handler(
+                    {"message": "a connection cannot be accepted", "exception": error}
+                )
+                await asyncio.sleep(REFUSED_S)
+            await asyncio.sleep(ACCEPTING_S)
+
+    def close(self) -> None:
+        """Stop listening; connections stay open."""
+        for task in self._tasks:
+            task.cancel()
+        for each in self._sockets:
+            each.close()
+        self._server.close()
+
+
+def stream_protocol(
+    serve: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]],
+) -> Callable[[], asyncio.BaseProtocol]:
+    """Return what makes the protocol of connections that a coroutine serves with streams."""
+    return lambda: asyncio.StreamReaderProtocol(asyncio.StreamReader(), serve)
+
+
+async def listen(make: Callable[[], asyncio.BaseProtocol], host: str, port: int, backlog: int) -> Listener:
+    """Listen on TCP; `make` makes the protocol of a connection.
+
+    Raises OSError or UnicodeError if the address is not available.
+    """
+    server = await asyncio.get_running_loop().create_server(make, host, port, start_serving=False)
+    try:
+        return Listener(server, backlog, make)
+    except OSError:
+        server.close()
+        raise
 
 
 def limit_buffers(transport: asyncio.BaseTransport) -> None:

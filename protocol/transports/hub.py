@@ -24,12 +24,14 @@ from starhil.protocol.can.frame import CanFrame, format_candump
 from starhil.protocol.can.socketcand import CommandSplitter, format_frame, parse_send
 from starhil.protocol.errors import ProtocolError, reason
 from starhil.protocol.transports.connections import (
-    TURN,
     WINDOW,
+    Budget,
     ConnectionLimit,
-    TurnProtocol,
+    Gate,
+    Listener,
     detect_lost_peer,
     limit_buffers,
+    listen,
 )
 
 _LOGGER: Final = logging.getLogger("starhil.hub")
@@ -44,22 +46,6 @@ BACKLOG_LIMIT: Final = 256 * 1024
 A kernel CAN socket holds fewer than 300 frames by default. Waiting frames are stale when read, and delay
 later ones.
 """
-
-LEAST_TURN: Final = 256
-"""Number of bytes that is read from a client at a time when many send much."""
-
-FREE_SHARE: Final = 0.02
-"""Share of the loop that a client may take without rests: 200 frames per second."""
-
-FREE_IN_ALL: Final = 0.3
-"""Share of the loop that all clients together may take without rests."""
-
-LEAST_TAKEN_S: Final = 0.001
-"""Processor time beyond the free share after which a client rests, seconds."""
-
-REST: Final = 3.0
-"""Length of a rest: this many times what the client has taken. Clients that rest do so one after another, so that all of them
-together leave three quarters of the loop to the links."""
 
 SETTLE_S: Final = 1.0
 """Longest time that frames are withheld from a client that has just entered raw mode.
@@ -134,7 +120,7 @@ class FairQueue:
             del self._lines[sender], self._sizes[sender]
 
 
-class _Client(TurnProtocol):
+class _Client(asyncio.Protocol):
     _transport: asyncio.Transport
 
     def __init__(self, hub: CanHub) -> None:
@@ -143,11 +129,6 @@ class _Client(TurnProtocol):
         self._waiting = FairQueue(BACKLOG_LIMIT)
         self._full = False
         self._settle: asyncio.TimerHandle | None = None
-        self._rest: asyncio.TimerHandle | None = None
-        """Its end, while nothing more is read."""
-        self._taken_s = 0.0
-        """Processor time that the client has taken beyond its free share, seconds."""
-        self._counted_s = 0.0
         self._error_answered = False
         """Whether a malformed command in what was read last has been answered."""
         self.bus: str | None = None
@@ -155,8 +136,6 @@ class _Client(TurnProtocol):
         self.remote = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        if not self._hub.limit.admits(transport, len(self._hub.clients)):
-            return
         self._transport = cast("asyncio.Transport", transport)
         detect_lost_peer(transport)
         limit_buffers(transport)
@@ -167,11 +146,7 @@ class _Client(TurnProtocol):
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (asyncio's signature)
         if self._settle is not None:
             self._settle.cancel()
-        if self._rest is not None:
-            self._rest.cancel()
-            self._end_rest()
-        if self in self._hub.clients:  # not rejected
-            self._hub.clients.remove(self)
+        self._hub.clients.remove(self)
 
     def pause_writing(self) -> None:
         self._full = True
@@ -180,36 +155,8 @@ class _Client(TurnProtocol):
         self._full = False
         self._write_waiting()
 
-    def get_buffer(self, sizehint: int) -> bytearray:
-        """Return the buffer for the next bytes: the smaller, the more clients there are that may send at once."""
-        many = max(self._hub.resting, len(self._hub.clients) // 4)
-        self.read_size = max(TURN // (1 + many), LEAST_TURN)
-        return super().get_buffer(sizehint)
-
     def data_received(self, data: bytes) -> None:
-        """Process commands; a client that takes much of the loop then rests, until those have rested that rest already."""
-        loop = asyncio.get_running_loop()
-        begin_s, began_s = loop.time(), time.thread_time()
-        self._process(data)
-        now_s = loop.time()
-        free = min(FREE_SHARE, FREE_IN_ALL / len(self._hub.clients))
-        self._taken_s = max(self._taken_s - free * (now_s - self._counted_s), 0.0)
-        self._taken_s += time.thread_time() - began_s
-        self._counted_s = now_s
-        if self._taken_s > LEAST_TAKEN_S and self._rest is None and not self._transport.is_closing():
-            self._transport.pause_reading()
-            self._hub.resting += 1
-            taken_s = max(self._taken_s, now_s - begin_s)  # longer where other processes have the processor
-            self._hub.rested_s = max(self._hub.rested_s, now_s) + REST * taken_s
-            self._rest = loop.call_at(self._hub.rested_s, self._end_rest)
-
-    def _end_rest(self) -> None:
-        self._rest, self._taken_s = None, 0.0
-        self._hub.resting -= 1
-        if not self._transport.is_closing():
-            self._transport.resume_reading()
-
-    def _process(self, data: bytes) -> None:
+        """Process commands."""
         self._end_settling()
         self._error_answered = False
         frames: list[CanFrame] = []
@@ -313,26 +260,29 @@ class CanHub:
         self._log_path = log
         self._log: TextIO | None = None
         self._now = now
-        self._server: asyncio.Server | None = None
+        self._listener: Listener | None = None
+        self._budget = Budget()
         self.clients: Final[list[_Client]] = []
-        self.resting = 0
-        """Number of clients from which nothing is read for now."""
-        self.rested_s = 0.0
-        """Time of the loop at which the last of them has rested, seconds."""
 
     async def start(self) -> None:
         """Listen. Raises ProtocolError if the address or the log is not available."""
-        loop = asyncio.get_running_loop()
+
+        def admits(transport: asyncio.BaseTransport) -> bool:
+            return self.limit.admits(transport, len(self.clients))
+
         try:
-            self._server = await loop.create_server(
-                lambda: _Client(self), self.host, self.port, backlog=self.limit.size
+            self._listener = await listen(
+                lambda: Gate(self._budget, lambda: _Client(self), admits),
+                self.host,
+                self.port,
+                self.limit.size,
             )
         except (OSError, UnicodeError) as error:
             remedy = "--host" if isinstance(error, UnicodeError | socket.gaierror) else "--port"
             raise ProtocolError(
                 f"CAN hub: cannot listen at {self.host}:{self.port}: {reason(error)}; choose another {remedy}"
             ) from None
-        self.port = self._server.sockets[0].getsockname()[1]
+        self.port = self._listener.address[1]
         if self._log_path is not None:
             try:
                 self._log = self._log_path.open(
@@ -344,9 +294,9 @@ class CanHub:
 
     async def close(self) -> None:
         """Stop listening and drop all clients."""
-        if self._server is not None:
-            self._server.close()
-            self._server = None
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
         for client in tuple(self.clients):
             client.close()
         while self.clients:

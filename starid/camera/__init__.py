@@ -1,5 +1,5 @@
 """The geometry of a camera: directions to pixels and back, and its calibration."""
 
-from starid.camera.camera import DEFAULT_CAMERA, Camera, Model
+from starid.camera.camera import DEFAULT_CAMERA, DEFAULT_FOV_DEG, Camera, Model
 
-__all__ = ["DEFAULT_CAMERA", "Camera", "Model"]
+__all__ = ["DEFAULT_CAMERA", "DEFAULT_FOV_DEG", "Camera", "Model"]

@@ -25,11 +25,9 @@ from starid.arithmetic.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.attitude.wahba import solve_wahba
 from starid.camera.camera import Camera
+from starid.camera.parameter_array import LIMIT2
 from starid.camera.position_errors import SLOTS, camera_jacobian, rotation_jacobian
-from starid.camera.projection import (
-    LIMIT2,
-    project_kernel,
-)
+from starid.camera.projection import project_kernel
 from starid.errors import StaridError
 
 NAMES: Final = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")

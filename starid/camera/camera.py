@@ -1,4 +1,7 @@
-"""The camera: projection of directions in the sensor frame to pixels, and back."""
+"""The camera: projection of directions in the sensor frame to pixels, and back.
+
+The kernels are imported where they are called: the process that answers the bus knows its camera without numba.
+"""
 
 from __future__ import annotations
 
@@ -18,22 +21,13 @@ from starid.arithmetic.arrays import Array, Mask, elementwise
 from starid.arithmetic.elementary import atan2, square, tan
 from starid.arithmetic.matrices import lengths
 from starid.attitude import Attitude
-from starid.camera.projection import (
-    EQUIDISTANT,
-    FLAT,
-    K1,
-    LIMIT2,
-    PINHOLE,
-    WIDTH,
-    back_project_kernel,
-    is_one_to_one,
-    jacobian_kernel,
-    project_kernel,
-    undistorted_reach,
-)
+from starid.camera.parameter_array import EQUIDISTANT, FLAT, K1, LIMIT2, PINHOLE, WIDTH
 from starid.errors import StaridError
 
 Model = Literal["pinhole", "equidistant", "flat"]
+
+DEFAULT_FOV_DEG: Final = 42.0
+"""Width of the field of the thesis's sensor, degrees."""
 
 _MODEL_CODES: Final[dict[str, int]] = {"pinhole": PINHOLE, "equidistant": EQUIDISTANT, "flat": FLAT}
 _WIDEST_FOV_DEG: Final[dict[str, float]] = {"pinhole": 170.0, "equidistant": 360.0, "flat": 360.0}
@@ -96,7 +90,7 @@ class Camera:
     @classmethod
     def from_fov(
         cls,
-        fov_deg: float = 42.0,
+        fov_deg: float = DEFAULT_FOV_DEG,
         width: int = 937,
         height: int = 937,
         model: Model = "pinhole",
@@ -243,6 +237,8 @@ class Camera:
         inside : ndarray (n,) of bool
             The direction falls on the pixel array: [−0.5, width − 0.5) × [−0.5, height − 0.5).
         """
+        from starid.camera.projection import project_kernel
+
         return project_kernel(self.params, _table("directions", vectors, 3))
 
     def back_project(self, xy: ArrayLike) -> Array:
@@ -251,6 +247,8 @@ class Camera:
         The inverse of `project` to 1e-6 px. A position that sees no direction (a corner beyond the image
         circle of a very wide lens) gets NaN.
         """
+        from starid.camera.projection import back_project_kernel
+
         return back_project_kernel(self.params, _table("positions", xy, 2))
 
     def jacobian(self, vectors: ArrayLike) -> Array:
@@ -260,6 +258,8 @@ class Camera:
         by a small vector e (radians, sensor frame), the directions move by ``v × e``, so the positions move
         by ``J (v × e)``.
         """
+        from starid.camera.projection import jacobian_kernel
+
         return jacobian_kernel(self.params, _table("directions", vectors, 3))
 
 
@@ -361,6 +361,8 @@ def _one_to_one_limit(params: Array, border: Array) -> float:
     this root, so that no star from outside is folded into the image. On the disc the determinant of the whole
     distortion, tangential part included, must stay positive.
     """
+    from starid.camera.projection import is_one_to_one, undistorted_reach
+
     k1, k2, _, _, k3 = params[K1:WIDTH]
     if np.max(np.abs(params[K1:WIDTH])) > _LARGEST_TERM:
         raise _fold_error(params[K1:WIDTH].tolist())

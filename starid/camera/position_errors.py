@@ -11,7 +11,8 @@ from starid.arithmetic.arrays import Array
 from starid.arithmetic.elementary import square
 from starid.arithmetic.matrices import dot, inverse, product, root, sum_of_products
 from starid.camera.camera import Camera
-from starid.camera.projection import CX, CY, FX, FY, K1, K2, K3, P1, P2, jacobian_kernel, project_kernel
+from starid.camera.parameter_array import CX, CY, FX, FY, K1, K2, K3, P1, P2
+from starid.camera.projection import jacobian_kernel, project_kernel
 
 SLOTS: Final = (FX, FY, CX, CY, K1, K2, P1, P2, K3)
 """Places in `Camera.params` of the parameters `starid.camera.calibration.NAMES`."""

@@ -1,6 +1,6 @@
 """Compiled projection between directions and pixels for all camera models, on plain arrays.
 
-A camera is one array of numbers (`starid.camera.Camera.params`), so that other compiled kernels can call
+A camera is one array of numbers (`starid.camera.parameter_array`), so that other compiled kernels can call
 these functions without a Python object. A model maps a direction (x, y, z) in the sensor frame to the plane:
 
 - pinhole: ``(x/z, y/z)``, z > 0;
@@ -20,26 +20,24 @@ import numpy as np
 
 from starid.arithmetic.arrays import Array, Mask
 from starid.arithmetic.elementary import atan2, cos, hypot, sin
+from starid.camera.parameter_array import (
+    CX,
+    CY,
+    EQUIDISTANT,
+    FX,
+    FY,
+    HEIGHT,
+    K1,
+    K2,
+    K3,
+    LIMIT2,
+    MODEL,
+    P1,
+    P2,
+    PINHOLE,
+    WIDTH,
+)
 from starid.kernels.jit import compiled, inner_checked
-
-PINHOLE: Final = 0
-EQUIDISTANT: Final = 1
-FLAT: Final = 2
-
-MODEL: Final = 0
-FX: Final = 1
-FY: Final = 2
-CX: Final = 3
-CY: Final = 4
-K1: Final = 5
-K2: Final = 6
-P1: Final = 7
-P2: Final = 8
-K3: Final = 9
-WIDTH: Final = 10
-HEIGHT: Final = 11
-LIMIT2: Final = 12
-"""Squared radius, in the image plane, up to which the distortion is one-to-one."""
 
 _MAX_ITERATIONS: Final = 60
 _MAX_HALVINGS: Final = 40

@@ -54,7 +54,6 @@ SPHERICAL_EPOCH: Final = 2026.0
 
 _WIDEST_FRAME_DEG: Final = 120.0
 _PLANAR_FOV_DEG: Final = 40.0
-_SPHERICAL_FOV_DEG: Final = 42.0
 
 
 def frame_parameters(
@@ -88,7 +87,7 @@ def frame_parameters(
     if planar:
         width = _PLANAR_FOV_DEG if fov is None else fov
         return DatabaseParameters("planar", overlap, width, limit, side, magnitude, full_field)
-    camera = Camera.from_fov(_SPHERICAL_FOV_DEG if fov is None else fov)
+    camera = Camera.from_fov() if fov is None else Camera.from_fov(fov)
     return DatabaseParameters.for_camera(
         camera, overlap=overlap, kappa=limit, direction=side, band=magnitude, full_field=full_field
     )

@@ -1,18 +1,14 @@
-"""How many of the kernels that a process compiles are in the cache, seen from a process that imports none of them.
-
-Installations with equal sources share the folder, but not the kernels: numba has a folder for each path in it.
-"""
+"""How many of the kernels that a process compiles are in the cache, seen from a process that imports none of them."""
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import re
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from starid.kernels.kernel_cache import sources_key
+from starid.kernels.kernel_cache import kernels_key
 from starid.storage.cache import kernel_folder
 
 _IMPORT: Final = re.compile(r"^(?:from|import)[ \t]+([\w.]+)(?:[ \t]+import[ \t]+(.+))?", re.MULTILINE)
@@ -25,17 +21,17 @@ class CompileProgress:
 
     def __init__(self, modules: Iterable[str]) -> None:
         self.kernels: Final = kernels_of(modules)
-        """Names as numba gives them to folders and files: `package_hash/module.function`."""
-        self._folder: Final = kernel_folder(sources_key())
+        """Names as numba gives them to their files: `module.function`."""
+        self._folder: Final = kernel_folder(kernels_key())
 
     def compiled(self) -> int:
         """Return how many are in the cache."""
         files = () if self._folder is None else self._folder.glob("*/*.nbi")
-        return len(self.kernels & {f"{path.parent.name}/{path.name.partition('-')[0]}" for path in files})
+        return len(self.kernels & {path.name.partition("-")[0] for path in files})
 
 
 def kernels_of(modules: Iterable[str]) -> frozenset[str]:
-    """Return `package_hash/module.function` of each kernel of some modules and of those that they import, directly or not."""
+    """Return `module.function` of each kernel of some modules and of those that they import, directly or not."""
     waiting, seen, kernels = list(modules), set[str](), set[str]()
     while waiting:
         module = waiting.pop()
@@ -44,10 +40,7 @@ def kernels_of(modules: Iterable[str]) -> frozenset[str]:
         if path is None:
             continue
         source = path.read_text(encoding="utf-8")
-        folder = (
-            f"{path.parent.name}_{hashlib.sha1(str(path.parent).encode(), usedforsecurity=False).hexdigest()}"
-        )
-        kernels |= {f"{folder}/{path.stem}.{function}" for function in _KERNEL.findall(source)}
+        kernels |= {f"{path.stem}.{function}" for function in _KERNEL.findall(source)}
         for package, members in _IMPORT.findall(source):
             waiting += [package, *(f"{package}.{member}" for member in re.findall(r"\w+", members))]
     return frozenset(kernels)

@@ -1,8 +1,9 @@
 """The folder in which numba caches the machine code of kernels.
 
 It is in the cache folder (`starid.storage.cache`), one for each state of the sources: numba notices that the file of a kernel has
-changed, but not that a function or constant which the kernel takes from another file has. Installations at the same path
-with equal sources share it. Numba does not check what it loads, so each file's checksum is kept beside it; a damaged file
+changed, but not that a function or constant which the kernel takes from another file has. Numba keeps the kernels of files at
+other paths and for other processors apart, so each has a folder of its own, in which all files are its kernels. Installations
+at the same path with equal sources share it. Numba does not check what it loads, so each file's checksum is kept beside it; a damaged file
 is removed, and its kernel compiled again.
 """
 
@@ -34,6 +35,8 @@ PACKAGES: Final = ("starid", "starhil/emulator/sensor")
 """Packages of which modules hold kernels."""
 
 _VERSIONS: Final = ("numba", "numpy")
+_PROCESSOR: Final = ("NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES")
+"""Environment variables that name the processor to compile for; by default this one."""
 _CHECKSUMS: Final = "checksums.json"
 _PATIENCE_S: Final = 5.0
 """Longest time for which a process waits until another one has recorded its checksums, seconds."""
@@ -54,7 +57,7 @@ def use_kernel_cache() -> bool:
     end of the process; if that leaves kernels to be compiled, a warning is logged.
     """
     check_working_folder()
-    key = sources_key()
+    key = kernels_key()
     folder = kernel_folder(key)
     try:
         if folder is not None and not _has_room(folder) and not (folder / _CHECKSUMS).exists():
@@ -165,11 +168,15 @@ def _read_checksums(folder: Path) -> tuple[dict[str, int], float]:
     return {}, 0.0
 
 
-def sources_key() -> str:
-    """Return 16 hexadecimal digits for the state of the modules with kernels, of all that they import, and of numba."""
+def kernels_key() -> str:
+    """Return 16 hexadecimal digits for the modules with kernels, all that they import, where they are, numba and the processor."""
     digest = hashlib.sha256()
     for name in _VERSIONS:
         digest.update(f"{name} {importlib.metadata.version(name)}\n".encode())
+    for name in _PROCESSOR:
+        digest.update(f"{name} {os.environ.get(name, '')}\n".encode())
+    for _, home in _homes():
+        digest.update(os.fsencode(home) + b"\n")
     for module, source in sorted(modules_with_kernels().items()):
         digest.update(module.encode() + b"\0" + source + b"\0")
     return digest.hexdigest()[:16]
@@ -178,17 +185,13 @@ def sources_key() -> str:
 def modules_with_kernels() -> dict[str, bytes]:
     """Return the sources of the modules with kernels and of those that they import, directly or not, by name."""
     sources, waiting = {}, []
-    for name in PACKAGES:
+    for name, home in _homes():
         top, _, rest = name.partition("/")
-        spec = importlib.util.find_spec(top)
-        for home in (spec.submodule_search_locations if spec else None) or ():
-            for path in (Path(home) / rest).rglob("*.py"):
-                module = ".".join((top, *path.relative_to(home).with_suffix("").parts)).removesuffix(
-                    ".__init__"
-                )
-                sources[module] = path.read_bytes()
-                if _HOLDS_KERNELS in sources[module]:
-                    waiting.append(module)
+        for path in (home / rest).rglob("*.py"):
+            module = ".".join((top, *path.relative_to(home).with_suffix("").parts)).removesuffix(".__init__")
+            sources[module] = path.read_bytes()
+            if _HOLDS_KERNELS in sources[module]:
+                waiting.append(module)
     needed: dict[str, bytes] = {}
     while waiting:
         module = waiting.pop()
@@ -199,3 +202,13 @@ def modules_with_kernels() -> dict[str, bytes]:
             waiting.append(package.decode())
             waiting += [f"{package.decode()}.{member}" for member in re.findall(r"\w+", members.decode())]
     return needed
+
+
+def _homes() -> list[tuple[str, Path]]:
+    """Return each of `PACKAGES` with the folder of its top package."""
+    specs = [(name, importlib.util.find_spec(name.partition("/")[0])) for name in PACKAGES]
+    return [
+        (name, Path(home))
+        for name, spec in specs
+        for home in (spec.submodule_search_locations if spec else None) or ()
+    ]

@@ -65,7 +65,6 @@ class NoiseModel:
 
     @property
     def magnitude_per_unit(self) -> float:
-        """Magnitudes per unit of intensity."""
         return (self.magnitude_range[1] - self.magnitude_range[0]) / INTENSITY_UNITS
 
     @classmethod

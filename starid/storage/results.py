@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.errors import StaridError
-from starid.storage.files import write_atomically
+from starid.storage.files import open_regular, read_text, write_atomically
 
 PLAN_FILE: Final = "plan.json"
 SEAL: Final = "seal_"
@@ -56,9 +54,9 @@ def read_results(path: Path, what: str) -> Results:
         The file is damaged.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: stored[name] for name in stored.files}
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        with open_regular(path) as stream, np.load(stream, allow_pickle=False) as stored:
+            return {name: np.asarray(stored[name]) for name in stored.files}
+    except Exception as error:  # numpy and zipfile raise nearly any for a damaged file
         raise StaridError(
             f"{what}: {path} cannot be read ({error}); remove it to compute it again"
         ) from error
@@ -100,7 +98,6 @@ class ResultStore:
             ) from error
 
     def file(self, part: str) -> Path:
-        """Return the file of a part."""
         return self.folder / f"{part}.npz"
 
     def load(self, part: str) -> Results | None:
@@ -150,7 +147,7 @@ class ResultStore:
     def _check_same(self, plan_file: Path, content: dict[str, Any]) -> None:
         """Reject a plan file with other content; the error names the first difference."""
         try:
-            kept = json.loads(plan_file.read_text(encoding="utf-8"))
+            kept = json.loads(read_text(plan_file))
         except (ValueError, RecursionError) as error:
             raise StaridError(
                 f"{self._what}: {plan_file} cannot be read ({error}): give another folder"

@@ -33,6 +33,17 @@ def test_a_profile_is_read_without_them(profile: str) -> None:
     assert not set(FOR_THE_WORKER) & set(done.stdout.split())
 
 
+def test_a_unit_without_images_and_distortion_runs_without_them() -> None:
+    text = """import sys
+from starhil.emulator.profile import load_profile
+from starhil.emulator.profile.pipeline_setup import make_pipeline
+profile = load_profile("ideal", ["run.worker=error_model"])
+make_pipeline(profile, None, repeatable=False, previews=False)
+print(*sys.modules)"""
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert not set(FOR_THE_WORKER) & set(done.stdout.split())
+
+
 def test_the_pipeline_starts_without_the_libraries_of_the_links() -> None:
     text = "import sys, starhil.emulator.sensor.pipeline.pipeline, starhil.emulator.sensor.pipeline.worker; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)

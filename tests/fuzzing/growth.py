@@ -215,7 +215,7 @@ def _canopen(unit: str) -> Channel:
 def _feed(form: Any, messages: list[bytes]) -> Channel:
     feed = LiveFeed(LiveTruth(Attitude.identity(), message_format=form), lambda: 1.0)
     datagrams = _Datagrams(feed, lines_per_s=1e12)
-    return Channel(messages, lambda data: datagrams.datagram_received(data, None))
+    return Channel(messages, lambda data: datagrams.datagram_received(data))
 
 
 def _whole(form: Format42) -> Channel:

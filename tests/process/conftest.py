@@ -11,8 +11,9 @@ from starhil.protocol.transports.can import kernel_can_is_up
 from tests.waiting import PATIENCE_S
 
 FAST_BAUD = 921600
-NO_IMAGES = "run.worker=error_model"
-"""Setting of an emulator whose images do not matter: it starts in a third of the processor time."""
+NO_IMAGES = ("run.worker=error_model", "camera.distortion=[]")
+"""Settings of an emulator whose images do not matter: it starts without numba, in a quarter of the processor time."""
+NO_IMAGES_OPTIONS = tuple(word for setting in NO_IMAGES for word in ("--set", setting))
 
 needs_vcan0 = pytest.mark.skipif(
     not kernel_can_is_up("vcan0"),
@@ -69,7 +70,7 @@ def sagitta(tmp_path_factory):
         profile="ideal",
         unit="sagitta",
         seed=1,
-        settings=[NO_IMAGES],
+        settings=NO_IMAGES,
         state_dir=tmp_path_factory.mktemp("sagitta"),
     )
     with EmulatorProcess(command) as process:

@@ -17,7 +17,7 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.protocol.files.bundled import find_unit
-from tests.process.conftest import NO_IMAGES
+from tests.process.conftest import NO_IMAGES, NO_IMAGES_OPTIONS
 from tests.process.test_sessions import starhil
 from tests.waiting import PATIENCE_S
 
@@ -65,7 +65,7 @@ def test_areas_pass_on_pty_bus_and_canopen_and_are_reported(tmp_path):
     areas += ["canopen.nmt", "canopen.sdo", "canopen.rpdo", "canopen.design"]
     junit, html = tmp_path / "c.xml", tmp_path / "c.html"
     links = ["--serial", "auto", "--can", "auto", "--canopen", "44"]
-    how = ("--start", *links, *SLOW_MOTION, "--set", NO_IMAGES)
+    how = ("--start", *links, *SLOW_MOTION, *NO_IMAGES_OPTIONS)
     outcomes = conform(*areas, *how, reports=("--junit", junit, "--html", html))
     assert len(outcomes) >= 120
     assert int(ET.parse(junit).getroot().get("tests")) == len(outcomes)
@@ -78,7 +78,7 @@ def test_safe_cases_change_nothing(tmp_path):
     rows = ("device_status", "boot_status", "star_config")
     areas = ["serial.framing", "serial.telemetry", "serial.identifiers", "serial.timing", "serial.recovery"]
     command = emulator_command(
-        seed=1, state_dir=tmp_path, settings=[NO_IMAGES], extra=["--clock", f"scaled:{SPEED}"]
+        seed=1, state_dir=tmp_path, settings=NO_IMAGES, extra=["--clock", f"scaled:{SPEED}"]
     )
     with EmulatorProcess(command) as emulator:
         port = emulator.ready["serial"]
@@ -114,7 +114,7 @@ def test_the_attitude_of_a_running_unit_is_compared_with_its_truth_log_or_a_stat
         seed=1,
         state_dir=tmp_path,
         truth_log=log,
-        settings=["truth.kind=fixed", attitude, NO_IMAGES],
+        settings=["truth.kind=fixed", attitude, *NO_IMAGES],
     )
     with EmulatorProcess(command) as emulator:
         words = ("serial.attitude", "--unit", "sagitta", "--serial", emulator.ready["serial"])

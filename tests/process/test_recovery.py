@@ -43,7 +43,7 @@ def own(tmp_path):
 
     def _make(settings=(), **options) -> EmulatorProcess:
         command = emulator_command(
-            seed=1, state_dir=tmp_path / "state", settings=[NO_IMAGES, *settings], **options
+            seed=1, state_dir=tmp_path / "state", settings=[*NO_IMAGES, *settings], **options
         )
         process = EmulatorProcess(command)
         processes.append(process)

@@ -82,7 +82,7 @@ def sky() -> np.ndarray:
 def test_a_client_by_the_text_reads_the_attitude_of_a_running_emulator(tmp_path):
     truth = f"truth.attitude={{ ra_deg = {RA_DEG}, dec_deg = {DEC_DEG}, roll_deg = {ROLL_DEG} }}"
     command = emulator_command(
-        profile="ideal", unit="st16", seed=1, settings=[NO_IMAGES, truth], state_dir=tmp_path
+        profile="ideal", unit="st16", seed=1, settings=[*NO_IMAGES, truth], state_dir=tmp_path
     )
     with EmulatorProcess(command) as process:
         port = os.open(process.ready["serial"], os.O_RDWR | os.O_NOCTTY)

@@ -34,7 +34,7 @@ def unit(tmp_path_factory):
         serial="off",
         can="auto",
         seed=1,
-        settings=["truth.attitude.roll_deg=30", NO_IMAGES],
+        settings=["truth.attitude.roll_deg=30", *NO_IMAGES],
         state_dir=state,
         extra=["--canopen", "44"],
     )
@@ -188,7 +188,7 @@ def pty_pair():
 def test_an_slcan_adapter_on_a_tty(tmp_path):
     with pty_pair() as (kernel_end, device_end):
         command = emulator_command(
-            serial="off", can=f"slcan:{device_end}", state_dir=tmp_path / "state", settings=[NO_IMAGES]
+            serial="off", can=f"slcan:{device_end}", state_dir=tmp_path / "state", settings=NO_IMAGES
         )
         with EmulatorProcess(command, ready_within_s=PATIENCE_S):
             daemon = subprocess.Popen([shutil.which("slcand"), "-F", "-S", "115200", kernel_end, "slcan0"])

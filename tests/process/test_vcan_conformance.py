@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.process.conftest import NO_IMAGES, needs_vcan0
+from tests.process.conftest import NO_IMAGES_OPTIONS, needs_vcan0
 from tests.process.test_conformance import conform
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
@@ -19,7 +19,7 @@ SPEED = 0.25
 
 def test_cases_about_frames_pass_on_the_kernel_bus():
     areas = [*(f"can.{area}" for area in CAN), *(f"canopen.{area}" for area in CANOPEN)]
-    how = ("--start", "--can", "auto", "--canopen", "44", "--speed", str(SPEED), "--set", NO_IMAGES)
+    how = ("--start", "--can", "auto", "--canopen", "44", "--speed", str(SPEED), *NO_IMAGES_OPTIONS)
     outcomes = conform(*areas, *how)
     assert {item["status"] for item in outcomes} == {"passed"}
     assert {item["id"].rpartition(".")[0] for item in outcomes} == set(areas)

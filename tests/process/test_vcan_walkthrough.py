@@ -17,8 +17,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.process.conftest import needs_vcan0
-from tests.test_docs import NO_IMAGES, PAGES, UNASKED, TypedPage, assert_shown, dumped
+from tests.process.conftest import NO_IMAGES_OPTIONS, needs_vcan0
+from tests.test_docs import PAGES, UNASKED, TypedPage, assert_shown, dumped
 from tests.waiting import PATIENCE_S
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
@@ -77,7 +77,7 @@ def running(line: str, environment: dict[str, str]) -> Iterator[Typed]:
 @contextlib.contextmanager
 def emulator_and_dump(page: TypedPage, environment: dict[str, str]) -> Iterator[Typed]:
     """Type the lines that start the emulator and candump; give the dump."""
-    run = f"{page.run} {shlex.join(NO_IMAGES)}"
+    run = f"{page.run} {shlex.join(NO_IMAGES_OPTIONS)}"
     with running(run, environment) as emulator:
         assert emulator.next_line(PATIENCE_S).startswith("ready can=socketcan:vcan0 ")
         with running(page.candump, environment) as dump:

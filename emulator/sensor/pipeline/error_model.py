@@ -39,6 +39,7 @@ from starhil.emulator.sensor.pipeline.messages import (
 from starhil.emulator.sensor.star_count import STARS_TO_V6, mean_stars
 from starhil.emulator.simulation.signal import Signal
 from starid.arithmetic.elementary import acos, hypot, log10, square
+from starid.camera import Camera
 
 ARCSEC: Final = math.radians(1.0 / 3600.0)
 
@@ -66,8 +67,6 @@ class ErrorModel:
     pending: Final = 0
 
     def __init__(self, setup: PipelineSetup) -> None:
-        from starid.camera import Camera  # with numba, which other pipelines load in a process of their own
-
         self._setup = setup
         self._camera = Camera.from_dict(setup.camera)
         self._constants: dict[str, Any] = self._camera.to_dict()
@@ -95,7 +94,6 @@ class ErrorModel:
         """Do nothing: there is no process."""
 
     def end(self, reason: str) -> None:
-        """End unexpectedly."""
         self._running = False
         self.ended.emit(reason)
 

@@ -29,6 +29,8 @@ _COMPANION_RAD: Final = math.radians(1.0)
 """Largest distance of a companion: with coarser pixels it would take minutes to find them all."""
 _COMPANION_PX: Final = 2.0
 _CATALOG_STREAM: Final = 3
+_STARS_PER_STREAM: Final = 1 << 17
+"""HIP numbers whose errors one generator draws in order: all of Hipparcos."""
 
 
 class SkyStars:
@@ -66,7 +68,6 @@ class SkyStars:
         """Errors of the catalogue for which directions and relative light have been drawn."""
 
     def __len__(self) -> int:
-        """Return the number of stars."""
         return len(self.rows)
 
     def shown(self, objects: SkyObjects | None, observer: Observer | None) -> tuple[Array, Array]:
@@ -121,9 +122,12 @@ def displaced(vectors: Array, east_arcsec: Array, north_arcsec: Array) -> Array:
 
 def _drawn(hip: Indices32, seed: int) -> Array:
     """Normal numbers (n, 3) of stars, which depend on their own HIP numbers alone: another star changes nothing for the others."""
-    return np.array(
-        [np.random.default_rng((seed, _CATALOG_STREAM, each)).normal(size=3) for each in hip.tolist()]
-    )
+    drawn = np.empty((len(hip), 3))
+    block, row = np.divmod(hip, _STARS_PER_STREAM)
+    for each in np.unique(block).tolist():
+        rng = np.random.default_rng((seed, _CATALOG_STREAM, each))
+        drawn[block == each] = rng.normal(size=(_STARS_PER_STREAM, 3))[row[block == each]]
+    return drawn
 
 
 def _with_errors(

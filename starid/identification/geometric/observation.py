@@ -9,23 +9,8 @@ import numpy as np
 
 from starid.arithmetic.arrays import Array, Indices
 from starid.arithmetic.elementary import atan2, cos, log10, sin
-from starid.camera.projection import (
-    CX,
-    CY,
-    FX,
-    FY,
-    K1,
-    K2,
-    K3,
-    MODEL,
-    P1,
-    P2,
-    PINHOLE,
-    distort_slopes,
-    from_plane,
-    plane_slopes,
-    undistort,
-)
+from starid.camera.parameter_array import CX, CY, FX, FY, K1, K2, K3, MODEL, P1, P2, PINHOLE
+from starid.camera.projection import distort_slopes, from_plane, plane_slopes, undistort
 from starid.kernels.jit import inner
 from starid.kernels.small_arrays import zero
 

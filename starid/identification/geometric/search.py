@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from starid.arithmetic.arrays import Array, Indices, Records
-from starid.camera.projection import CX, CY, HEIGHT, MODEL, WIDTH
+from starid.camera.parameter_array import CX, CY, HEIGHT, MODEL, WIDTH
 from starid.identification.geometric.answer import (
     Answer,
     Candidate,

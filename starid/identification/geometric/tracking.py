@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from starid.arithmetic.arrays import Array, Indices, Records
-from starid.camera.projection import MODEL
+from starid.camera.parameter_array import MODEL
 from starid.identification.geometric.answer import (
     MIN_MATCHED,
     Answer,

@@ -32,7 +32,7 @@ import numpy as np
 
 from starid.arithmetic.arrays import Array, Indices, Indices32
 from starid.arithmetic.elementary import exp, log, square
-from starid.camera.projection import MODEL
+from starid.camera.parameter_array import MODEL
 from starid.identification.geometric.matching import residual
 from starid.identification.geometric.observation import MAGNITUDE, SIGMA_U, SIGMA_V, Table, X, Y, Z, scaled
 from starid.identification.geometric.pattern_index import (

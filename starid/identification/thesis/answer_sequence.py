@@ -1,25 +1,27 @@
-"""Algorithm 3 by features alone: which answer to an image is kept, and how it relates to the last one.
+"""Algorithm 3: when the region is searched and when the whole database, which answer is kept, and how it relates to the last one.
 
 `RsiIdentifier` follows these rules on images, and `feature_error` on simulated ones, where it measures the errors of each kind of
-answer.
+answer by features alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 
 from starid.arithmetic.matrices import length
 from starid.attitude import Attitude
+from starid.identification.solution import Solution
 from starid.identification.thesis.feature_search import FeatureAnswer
 
 RIGHT_DEG: Final = 1.5
 """Error of the boresight up to which an answer is at the right place of the sky, degrees."""
 
 AnswerKind = Literal["first", "elsewhere", "region", "again"]
+Search: TypeAlias = Callable[[], FeatureAnswer | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +56,6 @@ class AnswerSequence:
         Largest ε_ψ with which a region fits, τ.
     largest
         Largest ε_ψ of an attitude, K·τ.
-
-    Attributes
-    ----------
-    exceeded
-        Whether the next image is searched in the whole database at once: the last answer was not good enough (section 6.3.2).
     """
 
     def __init__(self, threshold: float, largest: float) -> None:
@@ -68,13 +65,18 @@ class AnswerSequence:
 
     def reset(self) -> None:
         """Start again with the next image as the first."""
-        self.exceeded = False
+        self._exceeded = False
         self._images = 0
+
+    @property
+    def exceeded(self) -> bool:
+        """Whether the next image is searched in the whole database at once: the last answer was not good enough (section 6.3.2)."""
+        return self._exceeded
 
     def next(
         self,
         local: FeatureAnswer | None,
-        everywhere: Iterable[FeatureAnswer | None],
+        everywhere: Sequence[Search],
         last: Attitude | None,
         *,
         first: bool,
@@ -86,8 +88,7 @@ class AnswerSequence:
         local
             Answer of the region of search, if it was searched.
         everywhere
-            Answers of the whole database, as from an iterator that computes them: those after the first with an attitude are not asked
-            for, and none if the region fits.
+            Searches of the whole database in order: none is made if the region fits, and none after the first with an attitude.
         last
             Attitude of the last answer, carried by the motion; None if either is unknown.
         first
@@ -98,21 +99,29 @@ class AnswerSequence:
         else:
             best = self._best(local, everywhere)
             if best is None:
-                self.exceeded, self._images = True, 0
+                self._exceeded, self._images = True, 0
                 return None
             answer, kind = best, self._after_region(best, last, first=first)
         valid = answer.error_psi <= self._largest
         kept = KeptAnswer(answer, kind, self._images, valid)
-        self.exceeded = not valid or answer.error_psi > self._threshold
+        self._exceeded = not valid or answer.error_psi > self._threshold
         if not valid:
             self._images = 0
         return kept
 
-    def _best(
-        self, local: FeatureAnswer | None, everywhere: Iterable[FeatureAnswer | None]
-    ) -> FeatureAnswer | None:
+    def next_refined(self, local: Solution | None, everywhere: Callable[[], Solution]) -> Solution:
+        """Return the verified solution of the region or, without one, that of a search of the whole database.
+
+        With refinement a verified answer counts as one with ε_ψ ≤ τ, and any other as one above.
+        """
+        solution = everywhere() if local is None else local
+        self._exceeded = not solution.valid
+        return solution
+
+    def _best(self, local: FeatureAnswer | None, everywhere: Sequence[Search]) -> FeatureAnswer | None:
         best = local
-        for answer in everywhere:
+        for search in everywhere:
+            answer = search()
             if answer is not None and (best is None or answer.error_psi < best.error_psi):
                 best = answer
             if best is not None and best.error_psi <= self._largest:

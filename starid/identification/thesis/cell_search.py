@@ -70,7 +70,6 @@ class CellArrays(NamedTuple):
 
 
 def cell_arrays(database: FeatureDatabase) -> CellArrays:
-    """Collect the arrays of a database."""
     return CellArrays(database.sky.arrays, database.grid.arrays, database.minimum, database.scale)
 
 

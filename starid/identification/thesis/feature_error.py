@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, NamedTuple, Self
 
 import numpy as np
@@ -27,6 +28,7 @@ from starid.catalog.photometry import flux_ratio
 from starid.identification.thesis.answer_sequence import RIGHT_DEG, AnswerSequence, KeptAnswer
 from starid.identification.thesis.feature_search import FeatureSearch
 from starid.identification.thesis.features import FeatureVector
+from starid.storage.cache import Tables
 
 FIELDS: Final = 800
 """Number of simulated sequences."""
@@ -154,6 +156,34 @@ class FeatureErrors:
     region: tuple[ErrorTable, ...]
     again: tuple[ErrorTable, ...]
 
+    @property
+    def arrays(self) -> Tables:
+        """Arrays by name, from which `of_arrays` makes the same."""
+        kinds = {
+            "first": [self.first],
+            "elsewhere": [self.elsewhere],
+            "region": self.region,
+            "again": self.again,
+        }
+        arrays: Tables = {"upper": self.upper}
+        for kind, tables in kinds.items():
+            arrays[f"{kind}_squares"] = np.array([table.squares for table in tables])
+            arrays[f"{kind}_wrong"] = np.array([table.wrong for table in tables])
+        return arrays
+
+    @classmethod
+    def of_arrays(cls, arrays: Tables) -> Self:
+        def tables(kind: str) -> tuple[ErrorTable, ...]:
+            squares, wrong = (
+                np.asarray(arrays[f"{kind}_{name}"], np.float64) for name in ("squares", "wrong")
+            )
+            return tuple(map(ErrorTable, squares, wrong))
+
+        (first,), (elsewhere,) = tables("first"), tables("elsewhere")
+        return cls(
+            np.asarray(arrays["upper"], np.float64), first, elsewhere, tables("region"), tables("again")
+        )
+
     def of(self, kept: KeptAnswer, moved: float) -> StatedError:
         """Error of an answer, after a motion as a share of the width of the field."""
         if kept.kind in ("first", "elsewhere"):
@@ -192,7 +222,8 @@ class FeatureErrors:
                     if centre is None or sequence.exceeded
                     else search.answer_in_region(features, centre, side_deg)
                 )
-                kept = sequence.next(local, map(search.answer, (features,)), centre, first=centre is None)
+                everywhere = [partial(search.answer, features)]
+                kept = sequence.next(local, everywhere, centre, first=centre is None)
                 if kept is None:
                     break
                 kinds[kept.kind].add(kept, truth)

@@ -133,7 +133,6 @@ class FeatureSearch:
 
     @property
     def database(self) -> FeatureDatabase:
-        """The database."""
         return self.lost_in_space.database
 
     @property

@@ -83,7 +83,6 @@ class FrameGrid:
 
     @property
     def rows(self) -> int:
-        """Number of rows."""
         return int(self.row_columns.size)
 
     @property
@@ -93,7 +92,6 @@ class FrameGrid:
 
     @property
     def arrays(self) -> GridArrays:
-        """Arrays for the kernels."""
         return GridArrays(
             self.row_start, self.row_columns, self.row_dec_deg, self.row_ra_step_deg, self.first_ra_deg
         )

@@ -225,7 +225,6 @@ class FrameSky:
 
     @cached_property
     def arrays(self) -> SkyArrays:
-        """Arrays for the kernels."""
         return SkyArrays(self.stars, self.bin_start, self.frame)
 
     def features(self, ra_deg: float, dec_deg: float) -> FeatureVector:

@@ -13,10 +13,12 @@ with a star or two fewer or more (`FeatureSearch.doubtful_features`).
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,6 +49,8 @@ from starid.identification.thesis.feature_search import (
 )
 from starid.identification.thesis.lsi import LostInSpace
 from starid.identification.thesis.parts import Parts
+from starid.kernels.kernel_cache import kernels_key
+from starid.storage.cache import Tables, cached_tables
 
 STARS_PER_FIELD: Final = 10
 """Number of stars per field for the default brightness limit of the features: fewer make fields alike, and with more
@@ -163,18 +167,30 @@ class LsiIdentifier(VerifiedIdentifier):
             if options.refinement
             else None
         )
-        self._errors = None if options.refinement else self._feature_errors()
+        self._errors = (
+            None if options.refinement else self._feature_errors(sensor_stars.identity, parameters, deep)
+        )
         self.last_report = LsiReport(None, 0, 0, math.nan)
 
-    def _feature_errors(self) -> FeatureErrors:
+    def _feature_errors(self, *stars: object) -> FeatureErrors:
+        """Return the errors of features alone, which are measured once for what they depend on: `stars` and the options."""
         limit = self.options.detected_limit
         photometry = Photometry(
             self.database.parameters.kappa + 1.0 if limit is None else limit, self.options.magnitude_sigma
         )
         options = self.options
-        return FeatureErrors.of_search(
-            self.search, photometry, REGION_DEG, options.threshold, options.largest_error_psi
-        )
+        limits = REGION_DEG, options.threshold, options.largest_error_psi
+
+        def measured() -> Tables:
+            return FeatureErrors.of_search(self.search, photometry, *limits).arrays
+
+        if not options.cache or options.database is not None or self._parts != Parts():
+            return FeatureErrors.of_arrays(measured())
+        what = stars, self._camera.identity, options.solver, options.neighbours, photometry, limits
+        digest = hashlib.sha256(f"{kernels_key()} {what}".encode())
+        for file in sorted(Path(__file__).parent.glob("*.py")):
+            digest.update(file.read_bytes())
+        return FeatureErrors.of_arrays(cached_tables(f"features-{digest.hexdigest()[:16]}", measured))
 
     def _sensor_stars(self, limit: float) -> StarCatalog:
         """Stars to a magnitude as the sensor sees them: unresolved ones merged, with its own magnitudes as `v`."""
@@ -273,7 +289,7 @@ class LsiIdentifier(VerifiedIdentifier):
             return self.solve(measured, zero_points)
         fields = self.fields(measured, zero_points)
         sequence = AnswerSequence(self.options.threshold, self.options.largest_error_psi)
-        kept = sequence.next(None, map(self.answer, (fields,)), None, first=True)
+        kept = sequence.next(None, [partial(self.answer, fields)], None, first=True)
         return self.by_features_alone(kept, "lsi", fields)
 
     def _track(self, measured: CheckedDetections, predicted: Attitude, window_px: float | None) -> Solution:

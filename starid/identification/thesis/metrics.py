@@ -59,7 +59,6 @@ class Confusion:
         return np.array(dataclasses.astuple(self), dtype=np.int64)
 
     def percent(self, indicator: str) -> float:
-        """An indicator by name, percent."""
         return 100.0 * float(getattr(self, indicator))
 
     @classmethod

@@ -3,8 +3,8 @@
 The false-star filter (FSF) compares each image with those before it. The motion of its true stars (CME) carries the last
 attitude to the present image; the cells of a region around it are searched for the features of the true
 stars. If ε_ψ > τ, the whole database is searched as well, and the answer with the smaller ε_ψ is kept; one with
-ε_ψ > K·τ is invalid. While the answer kept has ε_ψ > τ, only the whole database is searched (section 6.3.2). With refinement,
-a verified answer counts as one with ε_ψ ≤ τ, and any other as one above.
+ε_ψ > K·τ is invalid. While the answer kept has ε_ψ > τ, only the whole database is searched (section 6.3.2);
+`answer_sequence` holds these rules.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -187,7 +188,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         """Find the attitude in the whole database, from the stars that the filter keeps."""
         prior = self.preprocess(measured.xy, measured.flux)
         if self.options.refinement:
-            solution = self._remembered(self._whole_sky(measured, prior))
+            solution = self._refined(measured, prior, None)
         else:
             solution = self._by_features(measured, prior, None, first=not self._sequence.exceeded)
         self._last = solution.attitude if solution.valid else None
@@ -218,7 +219,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         region = centre, min(side, self.lsi.database.parameters.fov_deg)
         searched = None if self._sequence.exceeded else region
         if self.options.refinement:
-            solution = self._remembered(self._refined(measured, prior, searched))
+            solution = self._refined(measured, prior, searched)
         else:
             solution = self._by_features(measured, prior, searched, first=False)
         report = prior.add_to(solution.features)
@@ -232,11 +233,6 @@ class RsiIdentifier(SingleCameraIdentifier):
         self._last = solution.attitude if solution.valid else None
         self._count(solution, report)
         return dataclasses.replace(solution, features=report)
-
-    def _remembered(self, solution: Solution) -> Solution:
-        """A refined solution, after which the region is searched if it was verified."""
-        self._sequence.exceeded = not solution.valid
-        return solution
 
     def _by_features(
         self,
@@ -256,7 +252,7 @@ class RsiIdentifier(SingleCameraIdentifier):
             features = self.lsi.search.features(fields[0][1].only(prior.true_stars))
             local = None if features is None else self._parts.region(self.lsi.search, features, *region)
         masks = [prior.true_stars] if prior.true_stars.all() else [prior.true_stars, None]
-        everywhere = (self.lsi.answer(fields, mask) for mask in masks)
+        everywhere = [partial(self.lsi.answer, fields, mask) for mask in masks]
         kept = self._sequence.next(local, everywhere, self._carried(prior), first=first)
         is_local = kept is not None and kept.answer is local
         solution = self.lsi.by_features_alone(kept, "rsi" if is_local else "lsi", fields, self._moved(prior))
@@ -326,24 +322,32 @@ class RsiIdentifier(SingleCameraIdentifier):
     def _refined(
         self, measured: CheckedDetections, prior: Preprocessed, region: tuple[Attitude, float] | None
     ) -> Solution:
-        """The first verified answer of the region with ε_ψ ≤ τ or, without one, of the whole database."""
+        """The solution with refinement, from a region of search if one is given, or from the whole database."""
         answers: list[FeatureAnswer] = []
+        local: Solution | None = None
         zero_point = self.lsi.zero_point
         if region is not None and zero_point is not None:
             field = self.lsi.search.field_stars(measured.xy, measured.flux, zero_point).only(prior.true_stars)
             answers = self._in_region(field, region)
-            for answer in answers:
-                if answer.error_psi > self._settings.tau:
+            local = self._verified(measured, field, answers)
+        return self._sequence.next_refined(local, lambda: self._whole_sky(measured, prior, answers[:1]))
+
+    def _verified(
+        self, measured: CheckedDetections, field: FieldStars, answers: Sequence[FeatureAnswer]
+    ) -> Solution | None:
+        """The first verified answer of the region with ε_ψ ≤ τ; None without one."""
+        for answer in answers:
+            if answer.error_psi > self._settings.tau:
+                continue
+            for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
+                if attitude is None:
                     continue
-                for attitude, _ in self.lsi.search.attitudes(field, answer.place, ESTIMATE_SHARE):
-                    if attitude is None:
-                        continue
-                    solution = self.lsi.verify(measured, attitude, WINDOW_PX)
-                    if solution.valid:
-                        self.lsi.learn(solution, measured.flux)
-                        report = report_of(answer, "rsi", refined=True)
-                        return dataclasses.replace(solution, mode="tracking", features=report)
-        return self._whole_sky(measured, prior, answers[:1])
+                solution = self.lsi.verify(measured, attitude, WINDOW_PX)
+                if solution.valid:
+                    self.lsi.learn(solution, measured.flux)
+                    report = report_of(answer, "rsi", refined=True)
+                    return dataclasses.replace(solution, mode="tracking", features=report)
+        return None
 
     def _in_region(self, field: FieldStars, region: tuple[Attitude, float]) -> list[FeatureAnswer]:
         """Answers of the cells of the region that are nearest to the features of a field.

@@ -67,7 +67,6 @@ def measured_step(step: RsiStep, frame: SimulatedFrame) -> tuple[float, ...]:
 
 
 def method_of(tau: float, memory: int = 0, side: str = BY_EQUATION) -> str:
-    """Name of a method."""
     if tau == LSI_ONLY:
         return "FSF-aided LSI"
     name = f"RSI, τ = {tau:g}"
@@ -77,7 +76,6 @@ def method_of(tau: float, memory: int = 0, side: str = BY_EQUATION) -> str:
 
 
 def noise_label(scale: float) -> str:
-    """Name of the noise of a scale."""
     return "noise as printed" if scale == PRINTED_SCALE else f"noise {scale:g}·√μ"
 
 

@@ -323,7 +323,7 @@ def test_a_live_feed_stays_until_its_replacement_is_open(run, protocol):
             refused = await control.do("set_truth", truth={**live, "host": "192.0.2.1", "port": 5000})
             assert not refused["ok"]
             assert emulation.feed is first
-            assert (first._transport or first._server) is not None
+            assert (first._datagrams or first._server) is not None
             assert (await control.do("status"))["feed"]["address"] == where
             port = int(where.rsplit(":", 1)[1])
             again = await control.do("set_truth", truth={**live, "port": port})

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import socket
 import threading
 import time
 from typing import Any
@@ -23,6 +25,7 @@ from starhil.protocol.errors import LONGEST_PROBLEM, MAX_PROBLEMS
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.fuzzing.control import _Loop
+from tests.waiting import until
 
 HOLD = {"do": "hold", "seconds": 1.0}
 LARGEST_ANSWER = (MAX_PROBLEMS + 1) * (LONGEST_PROBLEM + 10)
@@ -98,12 +101,12 @@ def test_a_datagram_is_read_up_to_a_number_of_lines_and_a_length() -> None:
     truth = LiveTruth(Attitude.identity())
     datagrams = _Datagrams(LiveFeed(truth, lambda: 1.0))
     message = b'{"q": [0, 0, 0, 1]}'
-    datagrams.datagram_received(b"\n".join([message] * MAX_LINES) + b"\n", None)
+    datagrams.datagram_received(b"\n".join([message] * MAX_LINES) + b"\n")
     assert (truth.accepted, truth.refused) == (MAX_LINES, 0)
-    datagrams.datagram_received(b"\n".join([message] * 3000), None)
+    datagrams.datagram_received(b"\n".join([message] * 3000))
     assert (truth.accepted, truth.refused) == (2 * MAX_LINES, 1)
     assert truth.last_fault == f"datagram of more than {MAX_LINES} lines"
-    datagrams.datagram_received(b'{"q": [' + b"0, " * 5000 + b"1]}", None)
+    datagrams.datagram_received(b'{"q": [' + b"0, " * 5000 + b"1]}")
     assert truth.last_fault == "message longer than 4096 bytes"
 
 
@@ -113,13 +116,48 @@ def test_of_a_flood_of_datagrams_only_so_many_messages_per_second_are_read() -> 
     datagrams = _Datagrams(LiveFeed(truth, lambda: 1.0))
     datagram, begin_s = b"\n".join([b'{"q": [0, 0, 0, 1]}'] * MAX_LINES), time.monotonic()
     for _ in range(400):
-        datagrams.datagram_received(datagram, None)
+        datagrams.datagram_received(datagram)
     assert BURST <= truth.accepted <= BURST + (time.monotonic() - begin_s) * MAX_LINES_PER_S + 1
     assert truth.last_fault == "more than 2000 messages per second"
     time.sleep(0.02)
     before = truth.accepted
-    datagrams.datagram_received(b'{"q": [0, 0, 0, 1]}', None)
+    datagrams.datagram_received(b'{"q": [0, 0, 0, 1]}')
     assert truth.accepted == before + 1
+
+
+def test_while_datagrams_come_too_fast_none_is_received_and_later_ones_are(monkeypatch: Any) -> None:
+    """To receive and drop each datagram of a flood took half of the loop."""
+    received: list[float] = []
+    process = _Datagrams.datagram_received
+
+    def noted(self: _Datagrams, data: bytes) -> None:
+        received.append(time.monotonic())
+        process(self, data)
+
+    monkeypatch.setattr(_Datagrams, "datagram_received", noted)
+    truth = LiveTruth(Attitude.identity())
+
+    async def main() -> float:
+        feed = LiveFeed(truth, lambda: 1.0)
+        address = await feed.start("udp", "127.0.0.1", 0)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+            peer.connect(("127.0.0.1", int(address.rpartition(":")[2])))
+            begin_s = time.monotonic()
+            while time.monotonic() < begin_s + 0.3:
+                for _ in range(20):
+                    peer.send(b'{"q": [0, 0, 0, 1]}')
+                await asyncio.sleep(0)
+            flooded_s = time.monotonic() - begin_s
+            count = len(received)
+            await asyncio.sleep(0.2)
+            before = truth.accepted
+            peer.send(b'{"q": [0, 0, 0, 1]}')
+            await until(lambda: truth.accepted == before + 1)
+        feed.close()
+        return count - flooded_s * MAX_LINES_PER_S
+
+    assert asyncio.run(main()) <= BURST + 1
+    assert truth.last_fault == "more than 2000 messages per second"
 
 
 def test_the_rest_of_a_file_with_very_many_errors_is_not_checked(tmp_path: Any) -> None:

@@ -10,6 +10,8 @@ from tests.emulator.runs import CAMERA, FirstHead, command, read
 from tests.emulator.workers import ANSWERING, WORKER
 from tests.waiting import PATIENCE_S, turns, until
 
+pytestmark = pytest.mark.long
+
 ENDS_AT_ONCE = ""
 ENDS_WHEN_READY = WORKER + f"send(PipelineReady({CAMERA}, 5, 0.0))\n"
 REJECTS = WORKER + "send(Failure('no catalogue'))\n"

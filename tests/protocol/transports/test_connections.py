@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import Any
+import random
+import socket
+import time
+from itertools import pairwise
+from typing import Any, cast
 
 import pytest
 from hypothesis import given, settings
@@ -13,7 +17,7 @@ from hypothesis import strategies as st
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.can.socketcand import format_send
 from starhil.protocol.transports.can import open_can
-from starhil.protocol.transports.connections import TURN, WINDOW
+from starhil.protocol.transports.connections import ACCEPTING_S, TURN, WINDOW, Budget, Gate, listen
 from starhil.protocol.transports.hub import BACKLOG_LIMIT, CanHub, FairQueue
 from tests.waiting import PATIENCE_S, turns, until
 
@@ -58,6 +62,84 @@ def test_every_item_is_delivered_or_counted_as_dropped(steps: list[tuple[int, li
         taken += len(queue.take(size))
     taken += len(queue.take(31))
     assert (put, queue.size) == (taken + dropped, 0)
+
+
+class Busy(asyncio.Protocol):
+    """A protocol that takes processor time for whatever it gets, and stops and resumes reading as one with a queue does."""
+
+    def __init__(self, busy_s: float) -> None:
+        self.busy_s = busy_s
+        self.spent_s = 0.0
+        self.got = b""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self.transport = cast("asyncio.Transport", transport)
+
+    def data_received(self, data: bytes) -> None:
+        self.got += data
+        begin_s = time.thread_time()
+        while time.thread_time() - begin_s < self.busy_s:
+            pass
+        self.spent_s += self.busy_s
+        self.transport.pause_reading()
+        asyncio.get_running_loop().call_later(0.001, self.transport.resume_reading)
+
+    def eof_received(self) -> bool:
+        self.got += b"end"
+        return False
+
+
+async def gated(protocol: Busy, data: bytes, seconds: float) -> float:
+    """Send data to a protocol through a gate until it has ended or for some time; return the time that it has spent, seconds."""
+    budget = Budget()
+    listener = await listen(
+        lambda: Gate(budget, lambda: protocol, lambda _transport: True), "127.0.0.1", 0, 8
+    )
+    _, writer = await asyncio.open_connection(*listener.address)
+    writer.write(data)
+    writer.write_eof()
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(seconds):
+            while not protocol.got.endswith(b"end"):
+                await asyncio.sleep(0.01)
+    spent_s = protocol.spent_s
+    protocol.transport.abort()
+    writer.transport.abort()
+    listener.close()
+    await until(lambda: (budget.accounts, budget.resting) == (0, 0))
+    return spent_s
+
+
+def test_a_connection_takes_a_quarter_of_the_loop_though_its_protocol_resumes_reading() -> None:
+    spent_s = asyncio.run(gated(Busy(0.005), bytes(4 << 20), 1.0))
+    assert 0.01 < spent_s < 0.4
+
+
+def test_what_comes_in_a_rest_is_passed_on_in_order_and_the_end_after_it() -> None:
+    data = random.Random(1).randbytes(60_000)
+    protocol = Busy(0.0015)
+    asyncio.run(gated(protocol, data, PATIENCE_S))
+    assert protocol.got == data + b"end"
+
+
+def test_a_server_accepts_connections_with_pauses() -> None:
+    """A peer that only opened and closed connections held up replies on the bus by 0.2 s."""
+    accepted: list[float] = []
+
+    async def main() -> None:
+        class Accepted(asyncio.Protocol):
+            def connection_made(self, transport: asyncio.BaseTransport) -> None:  # noqa: ARG002
+                accepted.append(asyncio.get_running_loop().time())
+
+        listener = await listen(Accepted, "127.0.0.1", 0, 64)
+        peers = [socket.create_connection(listener.address) for _ in range(30)]
+        await until(lambda: len(accepted) == len(peers))
+        for peer in peers:
+            peer.close()
+        listener.close()
+
+    asyncio.run(main())
+    assert min(after - before for before, after in pairwise(accepted)) >= ACCEPTING_S
 
 
 async def join(hub: CanHub) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:

@@ -108,11 +108,26 @@ def test_a_changed_callee_in_another_module_is_detected(tmp_path: Path) -> None:
 def test_the_key_follows_what_modules_with_kernels_import(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.syspath_prepend(write_package(tmp_path))
     monkeypatch.setattr(kernel_cache, "PACKAGES", ("other_kernels",))
-    key = kernel_cache.sources_key()
+    key = kernel_cache.kernels_key()
     (tmp_path / "other_kernels" / "unrelated.py").write_text("X = 1\n")
-    assert kernel_cache.sources_key() == key
+    assert kernel_cache.kernels_key() == key
     (tmp_path / "other_kernels" / "inner.py").write_text(INNER.format(slope=4.0))
-    assert kernel_cache.sources_key() != key
+    assert kernel_cache.kernels_key() != key
+
+
+def test_installations_elsewhere_and_other_processors_have_folders_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Progress counted the kernels of another checkout: all were compiled before the first was."""
+    monkeypatch.setattr(kernel_cache, "PACKAGES", ("other_kernels",))
+    keys = []
+    for name in ("here", "there"):
+        with monkeypatch.context() as context:
+            context.syspath_prepend(write_package(tmp_path / name))
+            keys.append(kernel_cache.kernels_key())
+            context.setenv("NUMBA_CPU_NAME", "generic")
+            keys.append(kernel_cache.kernels_key())
+    assert len(set(keys)) == 4
 
 
 def test_the_key_covers_every_module_with_kernels() -> None:
@@ -245,7 +260,7 @@ def test_nothing_is_cached_on_a_disk_without_room_unless_all_is_cached_already(
     cache_folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The start of a run ended with a traceback of numba, which could not write."""
-    monkeypatch.setattr(kernel_cache, "sources_key", lambda: "0123456789abcdef")
+    monkeypatch.setattr(kernel_cache, "kernels_key", lambda: "0123456789abcdef")
     monkeypatch.setattr(kernel_cache.atexit, "register", lambda *_arguments: None)
     monkeypatch.setenv("NUMBA_CACHE_DIR", "unchanged")
     monkeypatch.setattr(kernel_cache.shutil, "disk_usage", lambda _path: SimpleNamespace(free=1_000_000))
@@ -296,7 +311,7 @@ def test_others_cannot_change_kernels_whatever_the_umask(tmp_path: Path, cache_f
 def test_a_cache_that_can_only_be_read_is_used(
     tmp_path: Path, cache_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = cache_folder / "kernels" / kernel_cache.sources_key()
+    folder = cache_folder / "kernels" / kernel_cache.kernels_key()
     (folder / "package").mkdir(parents=True)
     (folder / "package" / "kernel.nbc").write_bytes(b"code")
     monkeypatch.setattr("starid.kernels.kernel_cache.os.access", lambda *_arguments: False)
@@ -313,7 +328,7 @@ def test_a_cache_that_can_be_neither_written_nor_copied_is_one_line(
     cache_folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The line had the name and the reason of every kernel."""
-    (cache_folder / "kernels" / kernel_cache.sources_key()).mkdir(parents=True)
+    (cache_folder / "kernels" / kernel_cache.kernels_key()).mkdir(parents=True)
     monkeypatch.setattr("starid.kernels.kernel_cache.os.access", lambda *_arguments: False)
 
     def full(*_arguments: object, **_options: object) -> None:

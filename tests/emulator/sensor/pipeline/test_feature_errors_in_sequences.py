@@ -1,7 +1,8 @@
 """The error that features alone state in a sequence of images is the error that they have, at rest and while the body turns.
 
 An answer is right to a fraction of a degree, or at another place of the sky. The images of a sequence show the same stars, so only
-sequences are independent: in the worst case all images of one are right, or all are wrong.
+sequences are independent: in the worst case all images of one are right, or all are wrong. So their number decides what the tests
+can tell, not that of images, of which there are enough for each class of an answer (`feature_error`).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from starid.attitude import propagate, random_attitude
 pytestmark = pytest.mark.long
 
 SEQUENCES = 30
-IMAGES = 8
+IMAGES = 5
 SIGMAS = 4.0
 """Tolerance in standard deviations of the mean of independent sequences."""
 RIGHT_DEG = 1.5

@@ -16,10 +16,13 @@ from starid.catalog import load_catalog
 from starid.errors import StaridError
 from starid.identification.solution import Reason
 from starid.identification.star_identifier import StarIdentifier, make_identifier
+from starid.identification.thesis import feature_error
 from starid.identification.thesis.database import DatabaseError, DatabaseParameters, build_database
 from starid.identification.thesis.database_choice import obtain_database
 from starid.identification.thesis.database_file import save_database
+from starid.identification.thesis.feature_error import FeatureErrors
 from starid.identification.thesis.lsi_identifier import LsiIdentifier
+from starid.identification.thesis.parts import Parts, rotation_between
 from starid.identification.thesis.rsi_identifier import RsiIdentifier
 from starid.identification.tracker import Tracker
 
@@ -109,6 +112,29 @@ def test_the_scikit_learn_solver_gives_the_same_verified_answers():
     ours, theirs = lsi().identify(xy, flux), reference.identify(xy, flux)
     assert theirs.valid
     assert theirs.quaternion_xyzw == pytest.approx(ours.quaternion_xyzw, abs=1e-12)
+
+
+def test_errors_of_features_alone_are_measured_once_for_what_they_depend_on(tmp_path, monkeypatch):
+    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(feature_error, "FIELDS", 60)
+    of_search, measured = FeatureErrors.of_search, []
+
+    def counted(*arguments):
+        measured.append(of_search(*arguments))
+        return measured[-1]
+
+    monkeypatch.setattr(FeatureErrors, "of_search", counted)
+    first, again, other = (
+        LsiIdentifier(refinement=False, magnitude_sigma=sigma).errors.arrays for sigma in (0.1, 0.1, 0.2)
+    )
+    assert len(measured) == 2
+    assert not np.array_equal(first["first_squares"], other["first_squares"])
+    for arrays in (first, again):
+        assert {name: values.tobytes() for name, values in arrays.items()} == {
+            name: values.tobytes() for name, values in measured[0].arrays.items()
+        }
+    LsiIdentifier(refinement=False, parts=Parts(motion=lambda then, now: rotation_between(then, now)))
+    assert len(measured) == 3, "other parts have other errors"
 
 
 def test_an_unknown_solver_of_an_identifier_is_rejected():
