@@ -9,6 +9,7 @@ from typing import Final
 import typer
 
 from starid.cli import command_line
+from starid.cli.output import compiling_reported
 
 COMMANDS: Final[dict[str, str]] = {
     name: f"starid.cli.{name}"
@@ -25,4 +26,5 @@ def build_app(words: Sequence[str] = ()) -> typer.Typer:
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run the command line with the given arguments, by default those of the process."""
-    command_line.run("starid", build_app, sys.argv[1:] if words is None else words)
+    with compiling_reported("starid.photograph.solver"):
+        command_line.run("starid", build_app, sys.argv[1:] if words is None else words)

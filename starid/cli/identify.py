@@ -194,13 +194,15 @@ def _solve(
 
 
 class _Progress:
-    """Reports the progress of a search on stderr every two seconds."""
+    """Reports the progress of a search on stderr every two seconds, counted from its first attempt: kernels are compiled before."""
 
-    def __init__(self) -> None:
-        self._begin = self._reported = time.monotonic()
+    _begin = 0.0
+    _reported = 0.0
 
     def __call__(self, attempt: str) -> None:
         now = time.monotonic()
+        if not self._begin:
+            self._begin = self._reported = now
         if now - self._reported >= _PROGRESS_EVERY_S:
             self._reported = now
             typer.echo(f"searching for {now - self._begin:.0f} s: {attempt}", err=True)

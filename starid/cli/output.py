@@ -5,7 +5,10 @@ from __future__ import annotations
 import codecs
 import io
 import sys
-from collections.abc import Callable, Iterable, Sequence
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TextIO, TypeAlias
 
@@ -42,6 +45,37 @@ _PLAIN: Final = {
 """Replacements for characters that the encoding of an output lacks."""
 
 _HANDLER: Final = "starhil-plain"
+
+_COMPILING_EVERY_S: Final = 5.0
+"""Time after which compiling is reported, and between reports, seconds."""
+
+
+@contextmanager
+def compiling_reported(module: str) -> Iterator[None]:
+    """Meanwhile, report on stderr how many kernels of a module are compiled, as long as their number grows."""
+    ended = threading.Event()
+
+    def report() -> None:
+        begin_s = time.monotonic()
+        if ended.wait(_COMPILING_EVERY_S):
+            return
+        from starid.kernels.compile_progress import CompileProgress
+
+        progress = CompileProgress([module])
+        compiled = progress.compiled()
+        while not ended.wait(_COMPILING_EVERY_S):
+            before, compiled = compiled, progress.compiled()
+            if compiled > before:
+                print(
+                    f"compiling: {time.monotonic() - begin_s:.0f} s, {compiled} of {len(progress.kernels)} kernels; later runs "
+                    "use them", file=sys.stderr, flush=True,
+                )  # fmt: skip
+
+    threading.Thread(target=report, daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
 
 
 def output_help(what: str) -> str:

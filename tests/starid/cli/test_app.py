@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import threading
 import tomllib
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -17,7 +18,8 @@ from starhil.emulator.sensor.renderer import render
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
-from starid.cli import app, identify
+from starid.cli import app, identify, output
+from starid.kernels.compile_progress import CompileProgress
 from tests.emulator.cli.command_line import run_command_line
 from tests.waiting import PATIENCE_S
 
@@ -146,3 +148,24 @@ def test_an_extra_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: py
     assert (status, out) == (2, "")
     assert said == "starid: matplotlib is not installed; run: pip install 'starhil[lab]'\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_compiling_is_reported_while_the_number_of_kernels_grows(monkeypatch, capsys):
+    numbers = iter((10, 10, 12, 12, 15))
+    counted = threading.Event()
+
+    def compiled(_progress: CompileProgress) -> int:
+        try:
+            return next(numbers)
+        except StopIteration:
+            counted.set()
+            return 15
+
+    monkeypatch.setattr(CompileProgress, "compiled", compiled)
+    monkeypatch.setattr(output, "_COMPILING_EVERY_S", 0.001)
+    with output.compiling_reported("starid.photograph.solver"):
+        assert counted.wait(PATIENCE_S)
+    total = len(CompileProgress(["starid.photograph.solver"]).kernels)
+    assert capsys.readouterr().err.splitlines() == [
+        f"compiling: 0 s, {number} of {total} kernels; later runs use them" for number in (12, 15)
+    ]
