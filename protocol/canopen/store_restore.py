@@ -91,9 +91,9 @@ class StoreRestore:
         """Set the entries to their defaults, then to their stored values."""
         dictionary = self._context.dictionary
         dictionary.load_defaults(self._context.node_id)
+        entries = {_name(entry): entry for entry in dictionary.entries.values()}
         for name, value in self._stored(COMMUNICATION).items():
-            index, _, subindex = name.partition(":")
-            entry = dictionary.entries.get((int(index, 16), int(subindex, 16)))
+            entry = entries.get(name)
             if entry is not None and _is_stored(entry) and entry.size in {None, len(value)}:
                 entry.value = value
 
@@ -193,10 +193,15 @@ class StoreRestore:
     def _changed(self) -> dict[str, bytes]:
         """Return the values that differ from their defaults, which may depend on the node ID."""
         return {
-            f"{entry.key[0]:04X}:{entry.key[1]:02X}": entry.value
+            _name(entry): entry.value
             for entry in self._context.dictionary
             if _is_stored(entry) and entry.value != default_bytes(entry.variable, self._context.node_id)
         }
+
+
+def _name(entry: Entry) -> str:
+    """Return the name under which the value of an entry is stored."""
+    return f"{entry.key[0]:04X}:{entry.key[1]:02X}"
 
 
 def _is_stored(entry: Entry) -> bool:

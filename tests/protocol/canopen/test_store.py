@@ -304,6 +304,12 @@ def test_a_restore_replaces_a_damaged_file(tmp_path):
     assert storage.load("a") == {}
 
 
+def test_a_stored_name_that_is_no_entry_is_ignored(new_bench):
+    storage = ParameterStorage()
+    storage.save("communication", {"HELLO:00": b"\0", "1017": b"\0\0", "1017:00": b"\xfa\0"})
+    assert new_bench(storage=storage).power_on().number(0x1017) == 250
+
+
 def test_a_changed_value_fails_the_checksum(tmp_path):
     path = tmp_path / "node.json"
     storage = FileStorage(path)
