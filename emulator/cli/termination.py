@@ -15,13 +15,17 @@ ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @contextlib.contextmanager
 def ended_by_signals(end: Callable[[], object]) -> Iterator[None]:
-    """Call `end` in the running event loop at SIGINT, SIGTERM and SIGHUP, but for those already ignored (`nohup`).
+    """Call `end` in the running event loop at SIGINT, SIGTERM and, unless it is ignored already (`nohup`), SIGHUP.
 
     From the end of the block they are ignored until the process has ended. Those of `add_signal_handler` have their
     default effect as soon as the event loop is closed, and one that came then would decide the exit status.
     """
     loop = asyncio.get_running_loop()
-    numbers = [number for number in ENDING if signal.getsignal(number) is not signal.SIG_IGN]
+    numbers = [
+        number
+        for number in ENDING
+        if number is not signal.SIGHUP or signal.getsignal(number) is not signal.SIG_IGN
+    ]  # a shell script starts what it puts in the background with SIGINT ignored
     received, arriving = socket.socketpair()
 
     def wake() -> None:

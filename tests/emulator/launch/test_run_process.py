@@ -34,11 +34,13 @@ class Emulator:
     """A running emulator with its control channel and serial line."""
 
     def __init__(self, *arguments: str) -> None:
-        default = "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL)"  # nohup has it ignored
+        signals = (  # as under a script that starts it in the background, but not under nohup
+            "import signal; signal.signal(signal.SIGHUP, signal.SIG_DFL); signal.signal(signal.SIGINT, signal.SIG_IGN)"
+        )
         command = [
             sys.executable,
             "-c",
-            f"{default}; from starhil.emulator.cli.app import main; main()",
+            f"{signals}; from starhil.emulator.cli.app import main; main()",
             "run",
             "ideal",
         ]
