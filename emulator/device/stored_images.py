@@ -49,10 +49,12 @@ class StoredImage:
 
     @property
     def file_size(self) -> int:
+        """Size of the file, bytes."""
         return BMP_HEAD.size + len(PALETTE) + len(self.pixels)
 
     @cached_property
     def file_crc(self) -> int:
+        """Checksum of the file."""
         return file_checksum(self.content())
 
     def content(self) -> bytes:

@@ -48,6 +48,8 @@ STATE_FOLDER: Final = "state"
 LONGEST_STANDSTILL_S: Final = 120.0
 """Wall time for which the successor of a killed pipeline may use no processor time before it is ready, seconds; a busy machine
 may let it wait, but not for so long."""
+RESTARTING_STEP_S: Final = 0.1
+"""Longest step while the pipeline is restarted, whose pauses are of the event loop, seconds."""
 TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
 
 
@@ -237,13 +239,17 @@ class UnitUnderTest:
             raise EmulatorError("endurance: the clock is not stepped")
         left, chunk, done = seconds, seconds if most is None else 1.0, 0
         while left > 0.0:
-            chunk = min(left, chunk, MAX_STEP_S)
+            chunk = min(left, chunk, RESTARTING_STEP_S if self._is_restarting() else MAX_STEP_S)
             done += await stepper.step(chunk)
             await asyncio.sleep(chunk)
             left -= chunk
             if most is not None and done >= most:
                 break
             chunk *= 2.0 if most is None or done < most // 4 else 1.0
+
+    def _is_restarting(self) -> bool:
+        device = self.head.device
+        return not device.warm and device.modes.error != PIPELINE_ENDED
 
     def deliver(self, link: str, item: bytes | CanFrame) -> None:
         """Pass bytes or a frame to the device."""

@@ -22,6 +22,11 @@ from starhil.protocol.icd.units_of_measure import factor
 
 BOOT_S: Final = 0.6
 """Longest boot of the profile of a run."""
+PIPELINE_RESTARTS_S: Final = (0.5, 1.0, 2.0, 4.0, 8.0)
+"""Pauses before restarts of an image pipeline that ends again within `STEADY_S` (docs/sensor.md)."""
+STEADY_S: Final = 60.0
+RESTART_LATE_S: Final = 0.2
+"""Longest delay of a restart that is due."""
 RECOVERY_S: Final = 15.0
 """Longest time from the end of the last fault to a valid attitude, with default parameters."""
 IMAGING: Final = frozenset({"lost_in_space", "tracking"})
@@ -67,6 +72,9 @@ class Oracle:
         self.bursts = False
         """Whether packets of a file may arrive."""
         self.now_s = 0.0
+        self._pipeline_ready_s = 0.0
+        """Time at which the image pipeline is restarted after its last end."""
+        self._pipeline_ends = 0
         self._drift_ppm = 0.0
         self._content: dict[str, Mapping[str, Any]] = {}
         """Fault of the content of a telemetry row, by its name."""
@@ -94,6 +102,7 @@ class Oracle:
         if factory:
             self._stored, self._boot_count = {}, 0
         self.now_s = 0.0
+        self._pipeline_ready_s, self._pipeline_ends = 0.0, 0
         self.stuck = False
         self._drift_ppm = 0.0
         self.content_failed(())
@@ -128,7 +137,8 @@ class Oracle:
                 self.modes.add("standby")
             if start is None or start[0] == "lost_in_space":
                 self.modes |= IMAGING
-            if self._started_s is not None and now_s - self._started_s > BOOT_S:
+            booted = self._started_s is not None and now_s - self._started_s > BOOT_S
+            if booted and (not self._pipeline_ends or now_s > self._pipeline_ready_s + RESTART_LATE_S):
                 self.modes.discard("boot")
         self._has_imaged = self._has_imaged or bool(self.modes & IMAGING)
 
@@ -139,6 +149,17 @@ class Oracle:
     def failed(self) -> None:
         """The unit must now be in the error mode, because of a fault or because its image pipeline has ended."""
         self.modes = {"error"}
+
+    def pipeline_ended(self) -> None:
+        """The image pipeline has ended unexpectedly; a boot lasts until it has been restarted."""
+        self.failed()
+        if self._pipeline_ends and self.now_s < self._pipeline_ready_s:
+            return  # it is being restarted
+        if self.now_s - self._pipeline_ready_s > STEADY_S:
+            self._pipeline_ends = 0
+        pause_s = PIPELINE_RESTARTS_S[min(self._pipeline_ends, len(PIPELINE_RESTARTS_S) - 1)]
+        self._pipeline_ready_s = self.now_s + pause_s
+        self._pipeline_ends += 1
 
     def content_failed(self, faults: Sequence[Mapping[str, Any]]) -> None:
         """The content of telemetry is wrong in these ways from now on, and in no other."""

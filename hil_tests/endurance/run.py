@@ -142,7 +142,7 @@ class LifeRun:
     async def _end_pipeline(self) -> None:
         if not await self._unit.end_pipeline():
             raise Violation("the image pipeline has not been restarted")
-        self._oracle.failed()
+        self._oracle.pipeline_ended()
 
     async def _disk(self, *, full: bool) -> None:
         self._unit.set_disk(full=full)

@@ -174,18 +174,21 @@ def test_a_log_whose_times_are_no_dates_is_none(tmp_path: Path, cell: str) -> No
     )
 
 
+ENDED_MEANWHILE = contextlib.suppress(FileNotFoundError, ProcessLookupError)
+"""Threads and processes do while they are looked at."""
+
+
 def readers_of(parent: int) -> list[int]:
     """Return the processes that read a file for another."""
-    children = [
-        int(child)
-        for task in Path(f"/proc/{parent}/task").iterdir()
-        for child in (task / "children").read_text().split()
-    ]
+    children: list[str] = []
+    for task in Path(f"/proc/{parent}/task").iterdir():
+        with ENDED_MEANWHILE:
+            children += (task / "children").read_text().split()
     readers = []
     for child in children:
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+        with ENDED_MEANWHILE:
             if b"reading_process" in Path(f"/proc/{child}/cmdline").read_bytes():
-                readers.append(child)
+                readers.append(int(child))
     return readers
 
 

@@ -27,6 +27,7 @@ from starhil.emulator.launch.unit_in_memory import links_of
 from starhil.emulator.links import base
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
+from starhil.emulator.run import revival
 from starhil.emulator.sensor.pipeline.client import WorkerClient
 from starhil.hil_tests.endurance.attitude_judge import Motion
 from starhil.hil_tests.endurance.life import UNRECORDED_STEPS, Life, Outcome, make_life
@@ -90,6 +91,30 @@ def test_a_pipeline_that_is_given_up_is_a_violation_of_its_life_alone(monkeypatc
     steps = ({"do": "end_pipeline"}, READ_MODE)
     outcome = run_once(Life("cubestar", 1, ("serial",), {}, steps, rendered=True))
     assert (outcome.violation, outcome.step) == ("the image pipeline has not been restarted", 0)
+
+
+@pytest.mark.parametrize(
+    ("second_pause_s", "violation"),
+    [(1.0, ""), (3.0, "device_status.mode: boot, but only lost_in_space, tracking is possible")],
+)
+def test_a_boot_lasts_until_a_pipeline_that_has_ended_twice_is_restarted(
+    monkeypatch, second_pause_s, violation
+):
+    """The oracle took a boot of one second, of a unit that was reset meanwhile, for a violation."""
+    monkeypatch.setattr(revival, "PAUSES_S", (0.5, second_pause_s))
+    status = {**READ_MODE, "row": ["", 161, "telemetry"]}
+    steps = (
+        {"do": "end_pipeline"},
+        {"do": "wait", "s": 20.0},
+        {"do": "end_pipeline"},
+        {"do": "fault", "fault": {"device": {"reset": "brown_out"}}},
+        {"do": "wait", "s": 0.8},
+        status,
+        {"do": "wait", "s": 0.7},
+        status,
+    )
+    profile = {"parameters": {"start_mode": "lost_in_space"}}
+    assert run_once(Life("cubestar", 1, ("serial",), profile, steps)).violation == violation
 
 
 def test_a_long_life_passes_the_wraps_of_its_counters():
