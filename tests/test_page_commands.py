@@ -231,7 +231,7 @@ class Shell:
         self._emulators.close()
 
     def ended(self) -> None:
-        """Wait for the end of an emulator that has been told to quit."""
+        """Wait for the end of an emulator that a request ends."""
         assert self._process.process.wait(timeout=PATIENCE_S) == 0
         self._process.kill()
 
