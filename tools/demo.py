@@ -196,7 +196,7 @@ def main() -> int:
     console.print(
         f"Open {out / 'first_light.png'}: the sky of the sensor, stretched, with the stars that were identified.\n"
         f"Images that the OBC downloaded: {', '.join(map(str, sorted(out.rglob('image_*.png'))))}; logs in the same folders.\n"
-        "They fill 235×235 and 469×469 pixels of the sizes that the unit downloads; the rest is black."
+        "They fill 469×469 and 235×235 pixels of the sizes that the unit downloads; the rest is black."
     )
     console.print(
         "Next: .venv/bin/starhil run --serial auto --can off, then open the port of its ready line with your OBC software; "
