@@ -1,9 +1,8 @@
 """Tracking under hard conditions: a device sees the whole field for some images, and then one that is mostly hidden.
 
 The first images are those from which the device estimates the rate (`device.rate_window`), a period of its update rate apart. From
-their attitudes follow the prediction and its uncertainty, as in the device. The last image is solved lost in space, with the
-prediction, and with the prediction in windows (`device.tracking_windows`). One image in twenty has a celestial pole, or RA 0°, in the
-middle of its field; the others look anywhere, at any roll.
+their attitudes follow the prediction and its uncertainty, as in the device. The last image is solved lost in space, and with the
+prediction. One image in twenty has a celestial pole, or RA 0°, in the middle of its field; the others look anywhere, at any roll.
 """
 
 from __future__ import annotations
@@ -30,9 +29,9 @@ from starid.identification.attitude_history import AttitudeHistory
 from starid.storage.results import Results
 
 LOST: Final = "lost in space"
-
-WAYS: Final = {LOST: (), "tracking": (), "tracking in windows": ("device.tracking_windows=true",)}
-"""Ways to solve the last image → settings of the profile."""
+TRACKED: Final = "tracking"
+WAYS: Final = (LOST, TRACKED)
+"""Ways to solve the last image."""
 
 _EVERY: Final = 20
 _SPECIAL_DEG: Final = ((0.0, 90.0), (0.0, -90.0), (0.0, 0.0), (359.9999, 40.0), (0.0001, -40.0))
@@ -77,23 +76,19 @@ class TrackingPlan:
         return math.ceil(self.frames / self.chunk)
 
 
-class TrackingDevice:
-    """The devices of a profile that solve the last image in the different ways."""
+class TrackingDevice(EcssDevice):
+    """The device of a profile that tracks."""
 
     def __init__(self, plan: TrackingPlan) -> None:
-        self._plan = plan
-        self._devices = {
-            way: EcssDevice(EcssPlan(plan.profile, (*plan.overrides, *settings), plan.seed))
-            for way, settings in WAYS.items()
-        }
-        device = self._devices[LOST]
-        self._images = device.profile.device.rate_window
-        parameters = device.parameters
+        super().__init__(EcssPlan(plan.profile, plan.overrides, plan.seed))
+        self._tracking = plan
+        self._images = self.profile.device.rate_window
+        parameters = self.parameters
         self._period_s = max(1.0 / float(parameters["update_rate"]), exposure_period_s(parameters))
 
-    def solve(self, number: int) -> Iterator[tuple[Any, ...]]:
-        """Solve an image in all ways; yield rows of RECORD."""
-        plan = self._plan
+    def rows(self, number: int) -> Iterator[tuple[Any, ...]]:
+        """Solve an image in both ways; yield rows of RECORD."""
+        plan = self._tracking
         rng = np.random.default_rng((plan.seed, number))
         truth, axis, jump = random_attitude(rng), rng.normal(size=3), rng.normal(size=3)
         if number % _EVERY == 0:
@@ -107,9 +102,9 @@ class TrackingDevice:
         if plan.blocked > 0.0:
             last = replace(last, faults=edge)
         known = history.uncertainty(0.0) if history.last and history.last[0] < 0.0 else None
-        for way, device in self._devices.items():
+        for way in WAYS:
             request = last
-            if way != LOST and known is not None:
+            if way == TRACKED and known is not None:
                 request = replace(
                     last,
                     predicted=history.predict(0.0, history.rate()),
@@ -117,7 +112,7 @@ class TrackingDevice:
                     prediction_freedom=known[1],
                     predicted_rate_rad_s=history.rate(),
                 )
-            result = self._answer(device, request)
+            result = self._answer(request)
             yield (number, way, result.valid, result.reason, *_errors(result, last.truth.attitude), result.matched,
                    1e3 * result.detect_s, 1e3 * result.identify_s)  # fmt: skip
 
@@ -126,9 +121,7 @@ class TrackingDevice:
         history = AttitudeHistory(self._images)
         for image in range(self._images):
             at = (image - self._images) * self._period_s
-            result = self._answer(
-                self._devices[LOST], self._request(number, image, propagate(truth, rate, at), rate)
-            )
+            result = self._answer(self._request(number, image, propagate(truth, rate, at), rate))
             if result.valid:
                 attitude = Attitude(np.array(result.quaternion_xyzw))
                 covariance = np.array(result.covariance_rad2)
@@ -136,20 +129,21 @@ class TrackingDevice:
         return history
 
     def _request(self, number: int, image: int, attitude: Attitude, rate: Array) -> FrameRequest:
-        device = self._devices[LOST]
         return FrameRequest(
             index=number * (self._images + 1) + image,
             truth=TruthState(attitude, rate),
-            exposure_s=device.exposure_s,
-            gain=device.gain,
-            settings=device.settings,
-            temperature_c=device.mean_c,
+            exposure_s=self.exposure_s,
+            gain=self.gain,
+            settings=self.settings,
+            temperature_c=self.mean_c,
         )
 
-    def _answer(self, device: EcssDevice, request: FrameRequest) -> FrameResult:
-        result = device.pipeline.handle(request)
+    def _answer(self, request: FrameRequest) -> FrameResult:
+        result = self.pipeline.handle(request)
         if not isinstance(result, FrameResult):
-            raise EmulatorError(f"campaign: profile {self._plan.profile}: {getattr(result, 'text', result)}")
+            raise EmulatorError(
+                f"campaign: profile {self._tracking.profile}: {getattr(result, 'text', result)}"
+            )
         return result
 
 
@@ -167,7 +161,7 @@ def run_chunk(plan: TrackingPlan, chunk: int) -> Results:
     """Solve the images of a part; return rows of RECORD."""
     device = of_thread(TrackingDevice, plan)
     numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, plan.frames))
-    return {"rows": np.array([row for number in numbers for row in device.solve(number)], RECORD)}
+    return {"rows": np.array([row for number in numbers for row in device.rows(number)], RECORD)}
 
 
 def run_tracking(plan: TrackingPlan, *, folder: Path | None = None, jobs: int = 1) -> Iterator[Results]:

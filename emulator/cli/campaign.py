@@ -479,8 +479,8 @@ def tracking(
 ) -> None:
     """Track through images of which most is hidden, after some that show the whole field.
 
-    The same images are solved lost in space, with the prediction from the attitudes before, and with it in windows. An image is
-    wrong if its attitude is valid but off by more than 0.1 deg. The exit status is 1 if any is wrong.
+    The same images are solved lost in space, and with the prediction from the attitudes before. An image is wrong if its attitude is
+    valid but off by more than 0.1 deg. The exit status is 1 if any is wrong.
     """
     from starhil.emulator.benchmarks.tracking_campaign import TrackingPlan, run_tracking, summarise
 

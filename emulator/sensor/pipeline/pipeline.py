@@ -234,13 +234,11 @@ class Pipeline:
         windows = self._detect_predicted(exposure, request, sensor)
         detections = self._detect(exposure, request, sensor) if windows is None else windows
         detected = time.perf_counter()
-        solution = self._solve(identifier, detections, request)
+        detections, solution = self._solve_or_follow(exposure, request, sensor, identifier, detections)
         if windows is not None and not solution.valid:
-            detections = self._detect(exposure, request, sensor)
+            whole = self._detect(exposure, request, sensor)
             detected = time.perf_counter()
-            solution = self._solve(identifier, detections, request)
-        if not solution.valid or _less_certain(solution, request):
-            detections, solution = self._follow(exposure, request, sensor, identifier, detections, solution)
+            detections, solution = self._solve_or_follow(exposure, request, sensor, identifier, whole)
         solved = time.perf_counter()
         times = (begin, rendered, detected, solved)
         result = self._frame_result(request, sensor, detections, solution, identifier, times)
@@ -389,6 +387,20 @@ class Pipeline:
     def _largest_error_deg(self) -> float:
         """Largest error of an attitude, degrees: the star identifier's, by default that of the device."""
         return float(self._setup.identifier.get("largest_error_deg", self._setup.largest_error_deg))
+
+    def _solve_or_follow(
+        self,
+        exposure: _Exposure,
+        request: FrameRequest,
+        sensor: SensorModel,
+        identifier: StarIdentifier,
+        detections: Detections,
+    ) -> tuple[Detections, Solution]:
+        """Identify detections; if that gives no attitude, or one that is less certain than the prediction, combine stars with it."""
+        solution = self._solve(identifier, detections, request)
+        if solution.valid and not _less_certain(solution, request):
+            return detections, solution
+        return self._follow(exposure, request, sensor, identifier, detections, solution)
 
     def _follow(
         self,

@@ -10,6 +10,7 @@ import pytest
 from starhil.emulator.benchmarks.tracking_campaign import (
     LOST,
     RECORD,
+    TRACKED,
     WAYS,
     TrackingPlan,
     run_chunk,
@@ -30,21 +31,22 @@ def test_a_hidden_field_is_tracked_and_not_found_lost_in_space() -> None:
     }
     assert all(row["wrong"] == 0 for row in rows.values())
     assert rows[LOST]["valid"] < 24
-    assert rows["tracking"]["valid"] > 40 * 0.95 - 3.0 * math.sqrt(40 * 0.95 * 0.05)
+    assert rows[TRACKED]["valid"] > 40 * 0.95 - 3.0 * math.sqrt(40 * 0.95 * 0.05)
     assert sum(rows[LOST]["invalid_reasons"].values()) == 40 - rows[LOST]["valid"]
 
 
 def test_the_whole_field_is_found_in_each_way() -> None:
     plan = TrackingPlan("cubestar", seed=5, frames=5, blocked=0.0, rate_deg_s=0.1)
-    assert [(row["valid"], row["wrong"]) for row in summarise(list(run_tracking(plan)))] == [(5, 0)] * 3
+    assert [(row["valid"], row["wrong"]) for row in summarise(list(run_tracking(plan)))] == [(5, 0)] * 2
 
 
 def test_after_a_jump_the_prediction_is_not_believed() -> None:
     """Images of the whole field contradict a prediction that is off by degrees: they are right, or invalid."""
     plan = TrackingPlan("cubestar", seed=6, frames=5, blocked=0.0, jump_deg=20.0)
-    lost, *tracked = summarise(list(run_tracking(plan)))
+    lost, tracked = summarise(list(run_tracking(plan)))
     assert lost["valid"] == 5
-    assert all(row["valid"] < 5 and row["wrong"] == 0 for row in tracked)
+    assert tracked["valid"] < 5
+    assert tracked["wrong"] == 0
 
 
 def test_an_image_depends_on_plan_and_number_only() -> None:
@@ -55,13 +57,13 @@ def test_an_image_depends_on_plan_and_number_only() -> None:
 
 
 def test_wrong_counts_valid_attitudes_only() -> None:
-    rows = np.zeros(6, RECORD)
-    rows["way"] = ["tracking"] * 4 + [LOST, "tracking in windows"]
-    rows["valid"] = [True, True, True, False, True, True]
-    rows["frame"] = range(6)
-    rows["cross_arcsec"] = [361.0, 1.0, 1.0, np.nan, 1.0, 1.0]
-    rows["roll_arcsec"] = [1.0, 361.0, 359.0, np.nan, 1.0, 1.0]
-    tracking = next(row for row in summarise([{"rows": rows}]) if row["way"] == "tracking")
+    rows = np.zeros(5, RECORD)
+    rows["way"] = [TRACKED] * 4 + [LOST]
+    rows["valid"] = [True, True, True, False, True]
+    rows["frame"] = range(5)
+    rows["cross_arcsec"] = [361.0, 1.0, 1.0, np.nan, 1.0]
+    rows["roll_arcsec"] = [1.0, 361.0, 359.0, np.nan, 1.0]
+    _, tracking = summarise([{"rows": rows}])
     assert (tracking["valid"], tracking["wrong"], tracking["wrong_frames"]) == (3, 2, [0, 1])
 
 
