@@ -27,6 +27,10 @@ MAX_RADIUS_PX: Final = BLOCK_PX / 2.0
 _RIVAL_SHARE: Final = 0.4
 """Flux from which another detection is like a star, as a share of the star's: a magnitude."""
 
+_NOISE_SIGMA: Final = 5.0
+_CLEARLY_SIGMA: Final = 2.0
+"""On an even background, a peak below five sigmas, as noise has them, is not like a star that is two sigmas higher."""
+
 _UNEVEN_SIGMA: Final = 1.0
 """Difference of the background in the quarters of a tile, in sigmas of a pixel, from which it is not smooth."""
 
@@ -94,7 +98,10 @@ def detect_near(image: GreyImage, places: Array, radius_px: float, settings: Det
     uneven = _uneven_tiles(mosaic, (rows, columns))[tile]
     searched = np.zeros(len(places), dtype=np.bool_)
     searched[used] = (tiles.max(axis=(1, 3)) > tiles.min(axis=(1, 3))).ravel()[: used.size]
+    ratio = detections.flux / detections.flux_sigma
+    no_noise = ratio >= np.minimum(ratio - _CLEARLY_SIGMA, _NOISE_SIGMA)[:, None]
     alike = (detections.flux >= _RIVAL_SHARE * detections.flux[:, None]) & (uneven == uneven[:, None])
+    alike &= uneven | no_noise
     count = np.count_nonzero(elsewhere & alike, axis=1)
     rivals = count / (np.pi * (square(MAX_RADIUS_PX) - square(radius_px)))
     near = np.flatnonzero(around & (distance <= radius_px))
