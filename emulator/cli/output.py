@@ -38,12 +38,12 @@ async def report_slow_start(algorithms: Iterable[str]) -> None:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Write the file of an option -o, whose folder is made; a failure is one line."""
+def writing(path: Path, sources: Iterable[Path | None] = ()) -> Iterator[None]:
+    """Write the file of an option -o, which is none of the sources, and whose folder is made; a failure is one line."""
     from starid.storage.files import removing_new_folders_on_error
 
     with removing_new_folders_on_error(path.parent):
-        prepare_output(path, "-o")
+        prepare_output(path, "-o", sources)
         with explained(f"{path}: cannot be written", "choose another file with -o"):
             yield
 

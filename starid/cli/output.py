@@ -83,16 +83,21 @@ def output_help(what: str) -> str:
     return f"{what} Missing folders are created; /dev/stdout is standard output."
 
 
-def prepare_output(path: Path, option: str) -> Path:
+def prepare_output(path: Path, option: str, sources: Iterable[Path | None] = ()) -> Path:
     """Create the folder of an output file, so that an invalid path fails before the work starts.
 
     Raises
     ------
     StaridError
-        The folder cannot be created, or the path is a folder, or a link of another user.
+        The folder cannot be created, or the path is a folder, or a link of another user, or one of the sources, the files that
+        are read.
     """
     if path.is_dir():
         raise StaridError(f"{path}: is a folder; name a file with {option}")
+    if path.is_file() and any(
+        source is not None and source.exists() and path.samefile(source) for source in sources
+    ):
+        raise StaridError(f"{path}: is a file that is read; name another one with {option}")
     try:
         check_links(path)
     except PermissionError as error:
