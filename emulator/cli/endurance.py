@@ -95,6 +95,7 @@ def command(
     repeat it; the exit status is then 1.
     """
     if life is not None:
+        from starhil.emulator.cli.life_file import read_life
         from starhil.protocol.unit import check_runs_no_code
 
         script, again = read_life(life), f"--life {shlex.quote(str(life))}"
@@ -256,26 +257,6 @@ def _write(path: Path, text: str) -> None:
     from starid.storage.files import write_atomically
 
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
-
-
-def read_life(path: Path) -> Any:
-    """Read a life that `write_life` has written."""
-    from starhil.hil_tests.endurance.life import Life
-    from starhil.protocol.files.user_file import read_user_text
-
-    try:
-        content = json.loads(read_user_text(path))
-        links, steps = tuple(content["links"]), tuple(content["steps"])
-        rendered = content.get("rendered", False) is True
-        foreign = content["profile"].keys() - {"parameters", "run"}
-        life = Life(str(content["unit"]), content["seed"], links, content["profile"], steps, rendered)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise EmulatorError(f"{path}: not a life of `starhil endurance`: {error}") from None
-    if foreign:
-        raise EmulatorError(
-            f"{path}: not a life of `starhil endurance`: profile.{min(foreign)}: no life has it"
-        )
-    return life
 
 
 # --- figures ---

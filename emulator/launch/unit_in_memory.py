@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from starhil.emulator.device.device import PIPELINE_ENDED
 from starhil.emulator.device.measurement import Measurement
@@ -33,6 +33,7 @@ from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.truth.config import TruthConfig
 from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.files.validation import problems
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
@@ -160,7 +161,14 @@ class UnitUnderTest:
                 "node": int(icd.device_parameters["canopen_node"].default) if "canopen" in links else 0
             },
         }
-        self.profile = Profile.model_validate({**profile, "unit": unit, "run": run, "links": channels})
+        table = {**profile, "unit": unit, "run": run, "links": channels}
+        try:
+            self.profile = Profile.model_validate(table)
+        except ValidationError as error:
+            raise EmulatorError(*map(str, problems(error, Profile, table))) from None
+        for name, value in self.profile.parameters.items():
+            if name in icd.device_parameters:
+                icd.device_parameters[name].check(value)
         self._folder = folder
         self._record = record
         self._emulator: Emulator | None = None

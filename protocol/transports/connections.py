@@ -320,32 +320,53 @@ class Listener:
         self._make = make
         self.address = server.sockets[0].getsockname()
         """Address of the first socket."""
-        self._sockets = [each.dup() for each in server.sockets]
-        for each in self._sockets:
-            each.listen(backlog)
-        self._tasks = [asyncio.create_task(self._accept(each)) for each in self._sockets]
+        self._loop = asyncio.get_running_loop()
+        self._pauses: dict[socket.socket, asyncio.TimerHandle | None] = {}
+        """Sockets, each with the end of its pause."""
+        self._connecting: set[asyncio.Future[object]] = set()
+        for each in server.sockets:
+            own = each.dup()
+            self._pauses[own] = None
+            own.listen(backlog)
+            self._end_pause(own)
 
-    async def _accept(self, listening: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                connection, _ = await loop.sock_accept(listening)
-                await loop.connect_accepted_socket(self._make, connection)
-            except ConnectionError:  # it has closed already
-                pass
-            except OSError as error:
-                loop.call_exception_handler(
-                    {"message": "a connection cannot be accepted", "exception": error}
-                )
-                await asyncio.sleep(REFUSED_S)
-            await asyncio.sleep(ACCEPTING_S)
+    def _end_pause(self, listening: socket.socket) -> None:
+        self._pauses[listening] = None
+        self._loop.add_reader(listening, self._accept, listening)
+
+    def _accept(self, listening: socket.socket) -> None:
+        pause_s = ACCEPTING_S
+        try:
+            connection, _ = listening.accept()
+        except (BlockingIOError, ConnectionError):  # it has closed already
+            pass
+        except OSError as error:
+            pause_s = REFUSED_S
+            self._loop.call_exception_handler(
+                {"message": "a connection cannot be accepted", "exception": error}
+            )
+        else:
+            connection.setblocking(False)  # noqa: FBT003 (the call of the library)
+            connecting = asyncio.ensure_future(self._loop.connect_accepted_socket(self._make, connection))
+            self._connecting.add(connecting)
+            connecting.add_done_callback(self._connected)
+        self._loop.remove_reader(listening)
+        self._pauses[listening] = self._loop.call_later(pause_s, self._end_pause, listening)
+
+    def _connected(self, connecting: asyncio.Future[object]) -> None:
+        self._connecting.discard(connecting)
+        if not connecting.cancelled():
+            connecting.exception()  # it has closed already
 
     def close(self) -> None:
         """Stop listening; connections stay open."""
-        for task in self._tasks:
-            task.cancel()
-        for each in self._sockets:
-            each.close()
+        for listening, pause in self._pauses.items():
+            if pause is None:
+                self._loop.remove_reader(listening)
+            else:
+                pause.cancel()
+            listening.close()
+        self._pauses.clear()
         self._server.close()
 
 
