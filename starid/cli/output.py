@@ -65,10 +65,11 @@ def compiling_reported(modules: Iterable[str], *, start: bool = False) -> Iterat
         from starid.kernels.compile_progress import CompileProgress
         from starid.storage import cache
 
-        progress, written, compiled = CompileProgress(modules), 0, ""
+        progress, written, compiled = None, 0, ""
         while True:
             before, written = written, cache.kernels_written_since(begin_unix_s)
             if written > before:
+                progress = progress or CompileProgress(modules)
                 at_most = len(progress.kernels)  # some options need fewer
                 compiled = (
                     f", {progress.compiled()} of at most {at_most} kernels compiled; later runs use them"

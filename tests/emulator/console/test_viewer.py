@@ -433,7 +433,7 @@ def test_the_requests_of_pages_that_only_view_take_a_part_of_the_loop(run, monke
 
 
 def test_the_requests_of_a_page_that_commands_do_not_wait_for_those_of_others(run, monkeypatch):
-    answered, message = [], Console._message
+    count, answered, message = 200, [], Console._message
 
     async def busy(self, viewer, request):
         answered.append(viewer.commands)
@@ -449,15 +449,14 @@ def test_the_requests_of_a_page_that_commands_do_not_wait_for_those_of_others(ru
             WireItem(0.0, "can", outgoing=False, item=CanFrame(0x04800104, extended=True))
         )
         async with Page(emulation) as page, Page(emulation, field="view_only") as viewer:
-            for number in range(16):
+            for number in range(count):
                 await viewer.socket.send_str(json.dumps({"id": number, "do": "message", "n": 0}))
-            for _ in range(5):
+            for _ in range(3):
                 await page.ask(do="message", n=0)
-            await viewer.message("answer", lambda item: item["id"] == 15)
 
     run(scenario, options=replace(OPTIONS, console=replace(OPTIONS.console, view_token="look")))
-    assert sum(answered) == 5
-    assert not answered[-1]
+    assert sum(answered) == 3
+    assert len(answered) < count / 2
 
 
 @pytest.mark.parametrize("kind", ["ping", "pong"])
