@@ -70,7 +70,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the marker."""
     config.addinivalue_line(
         "markers", "starhil(profile=None, settings=()): profile and settings of the emulator for a test"
     )

@@ -154,7 +154,6 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def live_from_seed(unit: str, seed: int, steps: int, kind: str, folder: Path) -> dict[str, Any]:
-    """Generate a life and live it."""
     from starhil.emulator.launch.unit_in_memory import links_of
     from starhil.hil_tests.endurance.life import make_life
     from starhil.hil_tests.judge.definition import unit_of
@@ -203,7 +202,6 @@ def live(life: Any, folder: Path) -> dict[str, Any]:
 
 
 def run_once(life: Any, *, record: Path | None = None) -> Any:
-    """Live a life once and return its outcome."""
     from starhil.emulator.launch.simulated_loop import SimulatedLoop
     from starhil.emulator.launch.unit_in_memory import UnitUnderTest
     from starhil.hil_tests.endurance.run import LifeRun

@@ -71,7 +71,6 @@ class MemoryTransport(Transport[Item]):
         """Do nothing: there is no port."""
 
     def send(self, item: Item) -> bool:
-        """Keep an item for the peer."""
         count = len(item) if isinstance(item, bytes) else 1
         if not self.reads:
             self.statistics.dropped += count
@@ -81,7 +80,6 @@ class MemoryTransport(Transport[Item]):
         return True
 
     def deliver(self, item: Item) -> None:
-        """Pass an item to the device."""
         self._receive(item)
 
     async def drain(self) -> None:
@@ -260,7 +258,6 @@ class UnitUnderTest:
         return not device.warm and device.modes.error != PIPELINE_ENDED
 
     def deliver(self, link: str, item: bytes | CanFrame) -> None:
-        """Pass bytes or a frame to the device."""
         self._transports[link].deliver(item)
 
     def take(self, link: str) -> list[tuple[float, Any]]:

@@ -27,6 +27,7 @@ from starid.identification.thesis.database import DatabaseError
 from starid.identification.thesis.database_file import load_database
 from starid.imaging.image_io import read_image, write_image
 from starid.storage.files import read_bytes, read_number, read_text, write_atomically
+from tests.users import OTHER_USER, needs_others
 from tests.waiting import PATIENCE_S
 
 READERS = [
@@ -73,7 +74,7 @@ def test_a_link_to_a_file_stays_a_link_and_the_file_is_replaced(tmp_path: Path) 
     assert list(target.parent.iterdir()) == [target]
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a link to another user")
+@needs_others
 @pytest.mark.parametrize("hidden", [False, True], ids=["", "behind an own link"])
 def test_a_link_of_another_user_is_not_followed(tmp_path: Path, *, hidden: bool) -> None:
     """In /tmp, it could lead to any file of this user, which was replaced."""
@@ -81,7 +82,7 @@ def test_a_link_of_another_user_is_not_followed(tmp_path: Path, *, hidden: bool)
     target.write_bytes(b"precious")
     link.symlink_to(target)
     own.symlink_to(link.name)
-    os.lchown(link, 12345, 12345)
+    os.lchown(link, OTHER_USER, OTHER_USER)
     path = own if hidden else link
     with pytest.raises(PermissionError, match="a link that user 12345 has made"):
         write_atomically(path, lambda part: part.write_bytes(b"whole"))
