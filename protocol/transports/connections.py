@@ -323,7 +323,7 @@ class Listener:
         self._loop = asyncio.get_running_loop()
         self._pauses: dict[socket.socket, asyncio.TimerHandle | None] = {}
         """Sockets, each with the end of its pause."""
-        self._connecting: set[asyncio.Future[object]] = set()
+        self._connecting: set[asyncio.Task[Any]] = set()
         for each in server.sockets:
             own = each.dup()
             self._pauses[own] = None
@@ -347,13 +347,13 @@ class Listener:
             )
         else:
             connection.setblocking(False)  # noqa: FBT003 (the call of the library)
-            connecting = asyncio.ensure_future(self._loop.connect_accepted_socket(self._make, connection))
+            connecting = self._loop.create_task(self._loop.connect_accepted_socket(self._make, connection))
             self._connecting.add(connecting)
             connecting.add_done_callback(self._connected)
         self._loop.remove_reader(listening)
         self._pauses[listening] = self._loop.call_later(pause_s, self._end_pause, listening)
 
-    def _connected(self, connecting: asyncio.Future[object]) -> None:
+    def _connected(self, connecting: asyncio.Task[Any]) -> None:
         self._connecting.discard(connecting)
         if not connecting.cancelled():
             connecting.exception()  # it has closed already
