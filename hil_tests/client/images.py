@@ -150,13 +150,13 @@ async def download_by_bursts(client: AsyncObcClient, size: str, *, within_s: flo
     if not files:
         raise BadReplyError("file_info: the list of files is empty after save_image")
     file = files[-1]
-    data, repeats, size = b"", 0, int(file["size"])
-    if size > LARGEST_FILE:
+    data, repeats, total = b"", 0, int(file["size"])
+    if total > LARGEST_FILE:
         raise BadReplyError(
-            f"file_info.size: {size} bytes are no image; at most {LARGEST_FILE} are downloaded"
+            f"file_info.size: {total} bytes are no image; at most {LARGEST_FILE} are downloaded"
         )
-    while len(data) < size:
-        left = min(MAX_BLOCK, size - len(data))
+    while len(data) < total:
+        left = min(MAX_BLOCK, total - len(data))
         block, rounds = await _download_block(client, int(file["counter"]), len(data), left, within_s)
         data += block
         repeats += rounds
