@@ -115,7 +115,7 @@ def command(
 
     if output is not None:
         image_suffix(output)
-        prepare_output(output, "-o")
+        prepare_output(output, "-o", (image, dark))
     colour = fov is not None if allow_colour is None else allow_colour
     pixels = read_image(image, allow_colour=colour)
     if dark is not None:

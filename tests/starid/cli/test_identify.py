@@ -107,6 +107,20 @@ def test_the_annotated_image_is_written_in_colour(tmp_path):
     assert (image[..., 0] != image[..., 1]).any()
 
 
+@pytest.mark.parametrize(
+    "command", [("annotate",), ("identify", "--fov", "42"), ("calibrate", "--fov", "42")]
+)
+def test_the_image_itself_is_not_written_over(tmp_path, command):
+    """`starid annotate` replaced a photograph by its annotated copy."""
+    image = tmp_path / "photo.png"
+    cv2.imwrite(str(image), np.zeros((64, 64), np.uint8))
+    before = image.read_bytes()
+    done = starid(*command, str(image), "-o", str(image))
+    assert isinstance(done.exception, StaridError)
+    assert "is a file that is read; name another one with -o" in str(done.exception)
+    assert image.read_bytes() == before
+
+
 def test_noise_alone_gives_no_attitude(tmp_path):
     image = tmp_path / "noise.png"
     cv2.imwrite(str(image), np.random.default_rng(1).normal(60, 4, (937, 937)).astype(np.uint8))
