@@ -22,6 +22,7 @@ from starhil.protocol.transports.connections import (
     Budget,
     ConnectionLimit,
     Listener,
+    limit_buffers,
     listen,
     stream_protocol,
 )
@@ -264,6 +265,7 @@ class LiveFeed:
         if not self._limit.admits(writer.transport, len(self._writers)):
             return
         self._writers.add(writer)
+        limit_buffers(writer.transport)
         try:
             await self._budget.run(self._answer_messages(reader, writer))
         except ConnectionError:
