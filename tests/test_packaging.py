@@ -40,7 +40,9 @@ def releases() -> tuple[str, list[tuple[str, str]]]:
     _, unreleased, *others = re.split(r"^## ", text, flags=re.MULTILINE)
     title, _, body = unreleased.partition("\n")
     assert title == "[Unreleased]"
-    return body.strip(), [re.findall(r"^\[(.*?)\] - (\d{4}-\d\d-\d\d)$", part, re.MULTILINE)[0] for part in others]
+    return body.strip(), [
+        re.findall(r"^\[(.*?)\] - (\d{4}-\d\d-\d\d)$", part, re.MULTILINE)[0] for part in others
+    ]
 
 
 def test_a_version_is_a_release_or_in_development_after_it():
@@ -55,7 +57,9 @@ def test_a_version_is_a_release_or_in_development_after_it():
 
 def test_the_citation_names_the_newest_release_and_its_date():
     text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    named = [re.findall(rf"^{key}: \W?([\d.-]+)\W?$", text, re.MULTILINE) for key in ("version", "date-released")]
+    named = [
+        re.findall(rf"^{key}: \W?([\d.-]+)\W?$", text, re.MULTILINE) for key in ("version", "date-released")
+    ]
     _, (newest, *_) = releases()
     assert named == [[part] for part in newest]
 

@@ -287,7 +287,16 @@ def test_a_bright_light_that_is_not_identified_is_explained(tmp_path):
 
 def test_stars_of_the_catalogue_in_one_spot_are_not_called_a_planet(tmp_path):
     image = tmp_path / "sky.png"
-    orion = ["--ra", "84", "--dec", "-1", "--fov", "20", "--size", "640x480"]  # with theta Orionis: four stars in two pixels
+    orion = [
+        "--ra",
+        "84",
+        "--dec",
+        "-1",
+        "--fov",
+        "20",
+        "--size",
+        "640x480",
+    ]  # with theta Orionis: four stars in two pixels
     assert starhil("render", *orion, "-o", str(image)).exit_code == 0
     (light,) = answer(image, "--fov", "20")["unidentified"]
     assert light["why"] == "4 stars of the catalogue in one spot, so its place is that of none"
