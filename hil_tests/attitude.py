@@ -80,7 +80,6 @@ def product(p: Sequence[float], q: Sequence[float]) -> Quaternion:
 
 
 def conjugate(q: Sequence[float]) -> Quaternion:
-    """Return the inverse of a unit quaternion."""
     x, y, z, w = q
     return Quaternion(-x, -y, -z, w)
 
@@ -198,7 +197,6 @@ def from_matrix(rows: Sequence[Sequence[float]]) -> Quaternion:
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """Return the vector product a × b."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 

@@ -216,7 +216,6 @@ class _Tally:
         self._identifier: Any = None
 
     def add(self, image: _Image) -> None:
-        """Identify the detections of an image."""
         pipeline, place = self._device.pipeline, image.number % self._scene.length
         if self._identifier is None:
             intact: Any = pipeline.identifier(image.request)

@@ -185,7 +185,6 @@ class EcssReport:
         return figures
 
     def figures(self) -> dict[str, Any]:
-        """Return the figures as plain values."""
         lines = {
             line.name: None
             if line.arcsec is None

@@ -187,7 +187,6 @@ class TargetOptions:
     dialect: SerialDialect = None
 
     def target(self) -> Target:
-        """Return the links."""
         from starhil.emulator.cli.bench_bus import Target
         from starhil.protocol.serial.cubespace import Dialect
 

@@ -124,7 +124,6 @@ def measure(
     *,
     realtime: bool = False,
 ) -> BusFigures:
-    """Measure each link of the target in turn."""
     figures = BusFigures()
     if target.can is not None:
         report(f"CAN: {rate:g} frames/s for {seconds:g} s")
@@ -170,7 +169,6 @@ def count_solved_frames(
 
 
 def print_figures(figures: BusFigures, good: bool) -> None:
-    """Print the figures as text."""
     if figures.can is not None:
         load = figures.can
         print(

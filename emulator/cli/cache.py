@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starhil.emulator.cli.options import OrbitChoice, ProfileArgument, names_of, with_orbit
-from starhil.emulator.cli.output import report_slow_start
+from starhil.emulator.cli.output import kernel_modules
 from starid.cli.options import AsJson
+from starid.cli.output import compiling_reported
 
 if TYPE_CHECKING:
     from starhil.emulator.profile import Profile
@@ -96,14 +97,13 @@ def warm(
 
     async def start(loaded: Profile) -> None:
         run = Run([loaded], previews=True)
-        progress = asyncio.create_task(report_slow_start([loaded.run.algorithm]))
-        try:
-            await run.open()
-            run.begin()
-            await run.ready()
-        finally:
-            progress.cancel()
-            await run.close()
+        with compiling_reported(kernel_modules([loaded.run.algorithm]), start=True):
+            try:
+                await run.open()
+                run.begin()
+                await run.ready()
+            finally:
+                await run.close()
 
     for number, each in enumerate(profiles, 1):
         log.info("%d of %d: %s, unit %s", number, len(profiles), each.name, each.unit_source)

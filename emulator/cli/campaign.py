@@ -126,7 +126,6 @@ class EcssOptions:
     jobs: Jobs = 1
 
     def plan(self) -> EcssPlan:
-        """Return the plan."""
         from starhil.emulator.benchmarks.ecss_campaign import EcssPlan
 
         return EcssPlan(
@@ -288,7 +287,6 @@ class PlanOptions:
         )
 
     def plan(self) -> CampaignPlan:
-        """Return the plan."""
         from starhil.emulator.benchmarks.campaign import CampaignPlan
 
         return CampaignPlan(
@@ -545,7 +543,6 @@ def _with_progress(chunks: Iterable[Any], total: int) -> Iterator[Any]:
 
 
 def _progress() -> Progress:
-    """Return progress bars on stderr."""
     from rich.console import Console
     from rich.progress import Progress
 

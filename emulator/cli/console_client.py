@@ -23,7 +23,6 @@ class ConsoleClient:
         """Device settings with which the client was made."""
 
     async def start(self) -> None:
-        """Open the link."""
         port = self._port
         self._settings = self._present_settings()
         link: HostLink[Any]
@@ -39,7 +38,6 @@ class ConsoleClient:
         await self._client.start()
 
     async def close(self) -> None:
-        """Close the link."""
         if self._client is not None:
             await self._client.close()
             self._client = None

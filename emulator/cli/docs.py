@@ -63,7 +63,6 @@ def _with_docstrings(directives: re.Match[str]) -> str:
 
 
 def names(incomplete: str) -> list[str]:
-    """Complete the name of a page."""
     return [name for name in pages() if name.startswith(incomplete)]
 
 

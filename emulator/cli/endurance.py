@@ -95,6 +95,7 @@ def command(
     repeat it; the exit status is then 1.
     """
     if life is not None:
+        from starhil.emulator.cli.life_file import read_life
         from starhil.protocol.unit import check_runs_no_code
 
         script, again = read_life(life), f"--life {shlex.quote(str(life))}"
@@ -153,7 +154,6 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def live_from_seed(unit: str, seed: int, steps: int, kind: str, folder: Path) -> dict[str, Any]:
-    """Generate a life and live it."""
     from starhil.emulator.launch.unit_in_memory import links_of
     from starhil.hil_tests.endurance.life import make_life
     from starhil.hil_tests.judge.definition import unit_of
@@ -202,7 +202,6 @@ def live(life: Any, folder: Path) -> dict[str, Any]:
 
 
 def run_once(life: Any, *, record: Path | None = None) -> Any:
-    """Live a life once and return its outcome."""
     from starhil.emulator.launch.simulated_loop import SimulatedLoop
     from starhil.emulator.launch.unit_in_memory import UnitUnderTest
     from starhil.hil_tests.endurance.run import LifeRun
@@ -256,26 +255,6 @@ def _write(path: Path, text: str) -> None:
     from starid.storage.files import write_atomically
 
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
-
-
-def read_life(path: Path) -> Any:
-    """Read a life that `write_life` has written."""
-    from starhil.hil_tests.endurance.life import Life
-    from starhil.protocol.files.user_file import read_user_text
-
-    try:
-        content = json.loads(read_user_text(path))
-        links, steps = tuple(content["links"]), tuple(content["steps"])
-        rendered = content.get("rendered", False) is True
-        foreign = content["profile"].keys() - {"parameters", "run"}
-        life = Life(str(content["unit"]), content["seed"], links, content["profile"], steps, rendered)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise EmulatorError(f"{path}: not a life of `starhil endurance`: {error}") from None
-    if foreign:
-        raise EmulatorError(
-            f"{path}: not a life of `starhil endurance`: profile.{min(foreign)}: no life has it"
-        )
-    return life
 
 
 # --- figures ---

@@ -27,12 +27,13 @@ def command(
     from starhil.emulator.cli.termination import ended_by_signals
     from starhil.emulator.simulation.guard import log_loop_errors_once
     from starhil.protocol.transports.hub import DEFAULT_BUS, CanHub
+    from starid.storage.files import open_output
 
     if log is not None:
         prepare_output(log, "--log")
 
     async def serve() -> None:
-        hub = CanHub(host, port, log=log)
+        hub = CanHub(host, port, log=log, opener=open_output)
         await hub.start()
         ended = asyncio.Event()
         log_loop_errors_once(asyncio.get_running_loop())

@@ -76,19 +76,19 @@ def export(
             raise EmulatorError(f"icd export {name}: writes several files; name a folder with -o")
         chosen = {} if rows is None else {"rows": [row.strip() for row in rows.split(",")]}
         for path, text in formats.export_folder(definition, name, **chosen).items():
-            _write(output / path, text)
+            _write(output / path, text, unit)
         return
     text = formats.export(definition, name)
     if output is None:
         print_text(text)
     else:
-        _write(output, text)
+        _write(output, text, unit)
 
 
-def _write(path: Path, text: str) -> None:
+def _write(path: Path, text: str, unit: str) -> None:
     from starid.storage.files import write_atomically
 
-    with writing(path):
+    with writing(path, Path(unit).glob("*")):
         write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 

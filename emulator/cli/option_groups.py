@@ -26,7 +26,6 @@ Result = TypeVar("Result")
 
 
 def with_option_groups(command: Callable[..., Result]) -> Callable[..., Result]:
-    """Return the command with the options of its groups as parameters."""
     signature = inspect.signature(command)
     hints = get_type_hints(command, include_extras=True)
     groups = {name: hints[name] for name in signature.parameters if dataclasses.is_dataclass(hints[name])}

@@ -43,7 +43,6 @@ class PointingOptions:
     ] = (0.0, 0.0, 0.0)
 
     def check(self) -> None:
-        """Check the angles and the rate."""
         for name, value in (("ra", self.ra), ("dec", self.dec), ("roll", self.roll)):
             if not -_TURN_DEG <= value <= _TURN_DEG:
                 raise EmulatorError(f"--{name} {value:g}: must be between -360 and 360 degrees")
@@ -65,7 +64,6 @@ class ExposureOptions:
     gain: Annotated[float | None, typer.Option(help="Analog gain, as a factor.")] = None
 
     def applied(self, sensor: SensorModel) -> SensorModel:
-        """Return the sensor with the given values."""
         changes = {
             "exposure_s": self.exposure,
             "limiting_magnitude": self.limit,
@@ -86,7 +84,6 @@ class LensOptions:
     model: Annotated[str | None, typer.Option(help="Projection: pinhole or equidistant.")] = None
 
     def applied(self, camera: Camera) -> Camera:
-        """Return the camera with the given values."""
         from starid.camera import Camera
 
         if self == LensOptions():

@@ -84,7 +84,7 @@ def command(
                 f"--set {setting}: a replay has `links` and `run`, except the algorithm, as recorded"
             )
     if csv_file is not None:
-        prepare_output(csv_file, "--csv")
+        prepare_output(csv_file, "--csv", folder.glob("*"))
     named = None if unit is None else absolute_unit(unit)
     if named is not None:
         settings = [*settings, f"unit={as_toml(named)}"]

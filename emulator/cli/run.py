@@ -25,11 +25,11 @@ from starhil.emulator.cli.options import (
     names_of,
     with_orbit,
 )
-from starhil.emulator.cli.output import report_slow_start
+from starhil.emulator.cli.output import kernel_modules
 from starhil.emulator.cli.termination import ended_by_signals
 from starhil.emulator.console.recorders import RECORDERS
 from starhil.emulator.errors import EmulatorError
-from starid.cli.output import output_help, prepare_output
+from starid.cli.output import compiling_reported, output_help, prepare_output
 
 if TYPE_CHECKING:
     from starhil.emulator.launch import Emulator, RunOptions
@@ -336,9 +336,8 @@ async def _serve(make: Callable[[], Emulator], algorithms: Collection[str]) -> i
         try:
             line = asyncio.create_task(_started(emulator))
             stop = asyncio.create_task(emulator.ended.wait())
-            progress = asyncio.create_task(report_slow_start(algorithms))
-            await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
-            progress.cancel()
+            with compiling_reported(kernel_modules(algorithms), start=True):
+                await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
             if line.done():
                 gc.collect()
                 gc.freeze()  # long-lived objects: garbage collection would pause the links

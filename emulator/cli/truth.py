@@ -69,7 +69,7 @@ def convert(
             truth = replace(truth, start_unix_s=unix_time(date))
         except ValueError as error:
             raise EmulatorError(f"--date {date}: {error}") from None
-    with writing(output):
+    with writing(output, (source,)):
         if output.suffix == ".tm":
             write_kernels(truth, output, structure)
         else:

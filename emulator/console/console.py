@@ -319,7 +319,6 @@ class Console:
     # --- requests of a page ---
 
     async def answer(self, viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
-        """Execute a request of a page and return the answer."""
         identity = {"type": "answer", "id": request.get("id")}
         action = self._actions.get(str(request.get("do")))
         if action is None:

@@ -319,7 +319,6 @@ class _Records(io.BufferedIOBase):
         self._position = 0
 
     def write(self, data: Any) -> int:
-        """Take bytes."""
         self._parts.append(bytes(data))
         self._position += len(data)
         return len(data)

@@ -71,17 +71,14 @@ HEARTBEAT_S: Final = 20.0
 
 MAX_VIEWERS: Final = 32
 
-TURN_S: Final = 0.002
-"""Shortest time between two requests, of any pages, seconds: the links of the device are served first."""
+REQUEST_TIME_S: Final = 0.0003
+"""Processor time that aiohttp spends on a request beside what is done here, seconds."""
 
-PAGE_TURN_S: Final = 0.01
-"""Shortest time between two requests of a page, seconds."""
+BEHIND_S: Final = 0.01
+"""Interval at which it is checked whether a page has read what it was sent, seconds."""
 
 EXPORT_PAUSE_S: Final = 0.2
 """Shortest time between two exports, of any pages, seconds."""
-
-OPENING_S: Final = 0.05
-"""Shortest time between two pages that open, seconds."""
 
 LINGER_S: Final = 1.0
 """Time for which the rest of a rejected request is read, so that its peer receives the answer, seconds."""
@@ -117,8 +114,7 @@ class ConsoleServer:
         self._consoles = consoles
         self.token = command_token or secrets.token_urlsafe(18)
         self._view_token = view_token
-        self._turn = asyncio.Lock()
-        self._opening = asyncio.Lock()
+        self._budget = Budget()
         self._exporting = asyncio.Lock()
         """Held while a thread makes an export: several would take the interpreter from the links."""
         self._static_files = {
@@ -161,7 +157,6 @@ class ConsoleServer:
         )
         await self._runner.setup()
         server, limit = cast("web.Server", self._runner.server), ConnectionLimit("console", BUSY)
-        budget = Budget()
 
         def admits(transport: asyncio.BaseTransport) -> bool:
             admitted = limit.admits(transport, len(server.connections))
@@ -170,7 +165,7 @@ class ConsoleServer:
             return admitted
 
         try:
-            self._listener = await listen(lambda: Gate(budget, server, admits), host, port, limit.size)
+            self._listener = await listen(lambda: Gate(self._budget, server, admits), host, port, limit.size)
         except (OSError, UnicodeError) as error:
             await self.close()
             raise EmulatorError(
@@ -193,8 +188,11 @@ class ConsoleServer:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Respond within the budget of all peers."""
+        return await self._budget.run(self._respond(request, handler), REQUEST_TIME_S)
+
+    async def _respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Reject other origins and, except for static files, requests without the token."""
-        await self._wait_for_turn()
         if not all(value.isascii() for value in request.headers.values()):  # aiohttp fails on some of them
             return web.Response(status=400, text="400: a header is not ASCII\n", headers=HEADERS)
         if not _is_same_origin(request):
@@ -322,9 +320,7 @@ class ConsoleServer:
         )
         tasks: set[asyncio.Task[None]] = set()
         try:
-            async with self._opening:
-                await console.welcome(viewer)
-                await asyncio.sleep(OPENING_S)
+            await console.welcome(viewer)
             console.join(viewer)
             tasks.add(asyncio.create_task(_pump(viewer, socket)))
             await self._receive(console, socket, viewer, tasks)
@@ -344,11 +340,6 @@ class ConsoleServer:
             await asyncio.sleep(EXPORT_PAUSE_S)
             yield
 
-    async def _wait_for_turn(self) -> None:
-        """Wait until `TURN_S` have passed since the request before, of any page."""
-        async with self._turn:
-            await asyncio.sleep(TURN_S)
-
     async def _receive(
         self, console: Console, socket: web.WebSocketResponse, viewer: Viewer, tasks: set[asyncio.Task[None]]
     ) -> None:
@@ -357,8 +348,7 @@ class ConsoleServer:
         Pings and pongs have their turns too: aiohttp would answer a flood of them without leaving the loop.
         """
         async for message in socket:
-            await asyncio.sleep(PAGE_TURN_S)
-            await self._wait_for_turn()
+            await asyncio.sleep(0)
             if message.type is WSMsgType.PING:
                 await socket.pong(message.data)
             if message.type is not WSMsgType.TEXT:
@@ -381,16 +371,15 @@ class ConsoleServer:
             task.add_done_callback(tasks.discard)
 
     async def _answer(self, console: Console, viewer: Viewer, request: dict[str, object]) -> None:
-        """Answer a request, once the page has read what it was sent and its earlier requests have begun.
-
-        The answers have turns of all pages too: requests of many pages that wait would else be answered at once.
-        """
+        """Answer a request, once the page has read what it was sent and its earlier requests have begun."""
         async with viewer.turn:
-            await asyncio.sleep(PAGE_TURN_S)
             while viewer.behind:
-                await asyncio.sleep(PAGE_TURN_S)
-            await self._wait_for_turn()
-        viewer.send(json.dumps(await console.answer(viewer, request)))
+                await asyncio.sleep(BEHIND_S)
+
+        async def execute() -> None:
+            viewer.send(json.dumps(await console.answer(viewer, request)))
+
+        await (execute() if viewer.commands else self._budget.run(execute()))
 
 
 class _ServerLog(logging.LoggerAdapter[logging.Logger]):

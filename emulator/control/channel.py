@@ -18,7 +18,7 @@ import asyncio
 import json
 import logging
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final, TypeVar, get_args
@@ -48,21 +48,17 @@ from starhil.protocol.errors import ProtocolError, did_you_mean, remedy
 from starhil.protocol.files.validation import problems
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.connections import (
-    Account,
     Budget,
     ConnectionLimit,
     Listener,
     detect_lost_peer,
+    limit_buffers,
     listen,
     stream_protocol,
 )
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
-
-STRANGER_TURN_S: Final = 0.02
-"""Shortest time between two requests of connections that have not shown the token, seconds: the links of the device are served
-first."""
 
 MAX_LINE: Final = 1 << 16
 """Longest request, bytes."""
@@ -109,8 +105,6 @@ class ControlServer:
         self._peers: dict[asyncio.StreamWriter, bool] = {}
         """Connections, the oldest first, and whether one of their requests was accepted."""
         self._limit = ConnectionLimit("control channel", BUSY_ANSWER)
-        self._stranger = asyncio.Lock()
-        """Held by the connection without the token whose request is next."""
         self._actions: dict[str, tuple[Action, tuple[str, ...] | None]] = {
             "status": (self._status, ()),
             "truth": (self._truth, ("run_time_s", "unix_s")),
@@ -162,19 +156,14 @@ class ControlServer:
         if not self._limit.admits(writer.transport, len(self._peers)):
             return
         self._peers[writer] = False
+        limit_buffers(writer.transport)
         if self._socket is None:
             detect_lost_peer(writer.transport, must_read=True)
+        lines = read_lines(reader, MAX_LINE, within_s=REQUEST_S)
         try:
-            with Account(self._budget) as account:
-                async for line in read_lines(reader, MAX_LINE, account=account, within_s=REQUEST_S):
-                    if self._token and not self._peers.get(writer):
-                        async with self._stranger:
-                            await asyncio.sleep(STRANGER_TURN_S)
-                    answer = await self.answer(line)
-                    if writer in self._peers:
-                        self._peers[writer] |= answer["ok"]
-                    writer.write(json.dumps(answer).encode() + b"\n")
-                    await writer.drain()
+            if self._token:
+                await self._budget.run(self._answer_lines(lines, writer, until_accepted=True))
+            await self._answer_lines(lines, writer)
         except ConnectionError as error:
             log.info("control channel: connection lost (%s)", error)
         except TimeoutError:
@@ -182,6 +171,23 @@ class ControlServer:
         finally:
             self._peers.pop(writer, None)
             writer.close()
+
+    async def _answer_lines(
+        self,
+        lines: AsyncIterator[bytes | None],
+        writer: asyncio.StreamWriter,
+        *,
+        until_accepted: bool = False,
+    ) -> None:
+        """Answer each request, or each up to the first that is accepted."""
+        async for line in lines:
+            answer = await self.answer(line)
+            if writer in self._peers:
+                self._peers[writer] |= answer["ok"]
+            writer.write(json.dumps(answer).encode() + b"\n")
+            await writer.drain()
+            if until_accepted and answer["ok"]:
+                return
 
     def _make_room(self) -> None:
         """Close the oldest connection that has not shown the token, if all places are taken and there is one."""

@@ -84,7 +84,6 @@ def _health(getter: Getter, field: Field, icd: InterfaceDefinition) -> Getter:
 
 
 def _accepted(telecommand: str, name: str) -> Getter:
-    """Return the getter for a last accepted value of a telecommand."""
     return lambda snapshot: snapshot.accepted.get(telecommand, {}).get(name)
 
 

@@ -41,7 +41,6 @@ class Counters:
         return Counters((self.telecommands + 1) & 0xFFFF, self.telemetry, self.flags, self.faults)
 
     def with_telemetry(self) -> Counters:
-        """Count a telemetry request."""
         return Counters(self.telecommands, (self.telemetry + 1) & 0xFFFF, self.flags, self.faults)
 
     def with_fault(self, fault: LinkFault) -> Counters:

@@ -154,7 +154,6 @@ class FrameCycle:
         )
 
     def start(self) -> None:
-        """Start exposures now."""
         if not self.running:
             self._grid_ns = self._now_ns()
             self._next = self._scheduler.at(self._grid_ns, self._start_exposure)

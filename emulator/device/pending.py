@@ -42,7 +42,6 @@ class PendingAnswer(Generic[Result]):
             self._observers.append(act)
 
     def then(self, convert: Callable[[Result], Other], *, accepted: bool = False) -> PendingAnswer[Other]:
-        """Return the answer whose result is computed from this one."""
         answer = PendingAnswer[Other](accepted=accepted)
         self.when_done(lambda result: answer.end(convert(result)))
         return answer

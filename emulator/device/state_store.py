@@ -66,7 +66,7 @@ class FileStore:
             raise EmulatorError(f"state folder {folder}: {why}; choose another with --state-dir") from None
 
     def load(self) -> dict[str, Any]:
-        """Return the last saved state; a corrupt file is renamed `device.json.corrupt`."""
+        """Return the last saved state; a corrupt file is renamed `device.json.corrupt`, or with a number if there is one."""
         remedy = "make it readable, or choose another folder with --state-dir"
         with explained(f"state file {self.path}: cannot be read", remedy):
             try:
@@ -78,7 +78,11 @@ class FileStore:
         if content is None:
             self.corrupt = True
             with explained(f"state file {self.path}: is corrupt, and cannot be renamed", "remove it"):
-                self.path.replace(self.path.with_name(STATE_FILE + ".corrupt"))
+                aside, number = self.path.with_name(STATE_FILE + ".corrupt"), 1
+                while os.path.lexists(aside):
+                    number += 1
+                    aside = self.path.with_name(f"{STATE_FILE}.corrupt-{number}")
+                self.path.replace(aside)
             return {}
         return content
 

@@ -195,7 +195,6 @@ class Injected:
         return np.array([across * cos(angle), across * sin(angle), z])
 
     def changed(self, row: Row, data: bytes) -> bytes:
-        """Return other data of a row."""
         fields = row.named_fields
         values = row.decode(data)
         changes = _changes(self.fault, fields, values)
@@ -357,7 +356,6 @@ def _vector_part(row: Row) -> list[str]:
 def _changes(
     fault: TelemetryFault, fields: Mapping[str, RowField], values: Mapping[str, Value]
 ) -> dict[str, Value]:
-    """Return the values that a fault replaces in a row."""
     changes: dict[str, Value] = {}
     negated = [*fault.negate]
     if fault.conjugate:

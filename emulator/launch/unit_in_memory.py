@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from starhil.emulator.device.device import PIPELINE_ENDED
 from starhil.emulator.device.measurement import Measurement
@@ -33,6 +33,7 @@ from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.truth.config import TruthConfig
 from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.files.validation import problems
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.base import Transport
@@ -70,7 +71,6 @@ class MemoryTransport(Transport[Item]):
         """Do nothing: there is no port."""
 
     def send(self, item: Item) -> bool:
-        """Keep an item for the peer."""
         count = len(item) if isinstance(item, bytes) else 1
         if not self.reads:
             self.statistics.dropped += count
@@ -80,7 +80,6 @@ class MemoryTransport(Transport[Item]):
         return True
 
     def deliver(self, item: Item) -> None:
-        """Pass an item to the device."""
         self._receive(item)
 
     async def drain(self) -> None:
@@ -160,7 +159,14 @@ class UnitUnderTest:
                 "node": int(icd.device_parameters["canopen_node"].default) if "canopen" in links else 0
             },
         }
-        self.profile = Profile.model_validate({**profile, "unit": unit, "run": run, "links": channels})
+        table = {**profile, "unit": unit, "run": run, "links": channels}
+        try:
+            self.profile = Profile.model_validate(table)
+        except ValidationError as error:
+            raise EmulatorError(*map(str, problems(error, Profile, table))) from None
+        for name, value in self.profile.parameters.items():
+            if name in icd.device_parameters:
+                icd.device_parameters[name].check(value)
         self._folder = folder
         self._record = record
         self._emulator: Emulator | None = None
@@ -252,7 +258,6 @@ class UnitUnderTest:
         return not device.warm and device.modes.error != PIPELINE_ENDED
 
     def deliver(self, link: str, item: bytes | CanFrame) -> None:
-        """Pass bytes or a frame to the device."""
         self._transports[link].deliver(item)
 
     def take(self, link: str) -> list[tuple[float, Any]]:

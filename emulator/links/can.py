@@ -72,7 +72,6 @@ class CanLink(RequestLink[CanFrame, int]):
         return bus
 
     async def close(self) -> None:
-        """Leave the bus."""
         self._address.release()
         if self._next is not None:
             self._next.cancel()

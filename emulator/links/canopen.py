@@ -245,7 +245,6 @@ class CanopenLink(Link[CanFrame]):
         return super().ready_fields | {"canopen": str(self._wanted_node)}
 
     async def close(self) -> None:
-        """Leave the bus."""
         self._node.release()
         await super().close()
 

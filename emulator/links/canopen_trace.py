@@ -63,7 +63,6 @@ class CanopenDecoder:
         """Transfers by node."""
 
     def line(self, frame: CanFrame) -> tuple[str, str]:
-        """Return kind and text of a frame."""
         node, function = frame.id & 0x7F, frame.id & 0x780
         if frame.id in (LSS_SLAVE, LSS_MASTER):
             return "canopen", "LSS reply" if frame.id == LSS_SLAVE else "LSS request"

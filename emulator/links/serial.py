@@ -21,7 +21,6 @@ class SerialDamage:
     """Corrupts bytes on a serial line."""
 
     def corrupt(self, item: bytes, rng: random.Random) -> bytes:
-        """Flip one bit of one byte."""
         damaged = bytearray(item)
         damaged[rng.randrange(len(item))] ^= 1 << rng.randrange(8)
         return bytes(damaged)

@@ -190,7 +190,6 @@ class Decoder:
 
 
 def values_text(row: Row | None, data: bytes) -> str:
-    """Format the first values of a row."""
     if row is None or not data:
         return ""
     try:

@@ -100,7 +100,6 @@ class WireFaults(Generic[Item]):
         self._send_or_hold(self._damage.split(item, settings.split) if settings.split else [item], settings)
 
     def _send(self, item: Item) -> None:
-        """Pass an item to the transport."""
         if self.listener is not None:
             self.listener(item)
         self._transmit(item)

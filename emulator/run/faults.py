@@ -156,7 +156,6 @@ EFFECTS: Final[Mapping[str, Effect]] = {
 
 
 def as_list(value: Any) -> Any:
-    """Return a list of a single table."""
     return [value] if isinstance(value, dict) else value
 
 
@@ -237,7 +236,6 @@ class Faults:
         device.signals.faults_changed.emit(request.model_dump(mode="json", exclude_unset=True))
 
     def check(self, request: FaultRequest) -> None:
-        """Check that the faults of a request can be injected."""
         if request.phase is not None:
             self._device.cycle.check_awaits()
         if request.device is not None:

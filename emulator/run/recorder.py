@@ -87,7 +87,6 @@ class Recorder(Wiring):
         self.write(entry, **values)
 
     def write(self, entry: type[TimedEntry], **values: Any) -> None:
-        """Write an entry with the time of the clock."""
         if self.file is not None:
             ns = self.clock.now_ns()
             self.file.append(lambda: entry(ns=ns, **values).line())

@@ -441,7 +441,6 @@ def _whole_number(name: str, value: int) -> int:
 
 
 def _rate(value: npt.ArrayLike) -> Array:
-    """Check a body rate."""
     rate = np.asarray(value, dtype=np.float64)
     if rate.shape != (3,) or not np.all(np.isfinite(rate)) or length(rate) > _MAX_RATE_RAD_S:
         raise EmulatorError(

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from starhil.emulator.errors import EmulatorError, one_line
-from starid.storage.files import check_links
+from starid.storage.files import open_output
 
 log: Final = logging.getLogger("starhil.output")
 
@@ -128,9 +128,8 @@ class OutputFile:
 
         So is a link of another user.
         """
-        check_links(self.path)
         flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
-        file = os.fdopen(os.open(self.path, flags, 0o644), "wb", buffering=0)
+        file = os.fdopen(open_output(self.path, flags), "wb", buffering=0)
         try:
             self._lock_and_empty(file, overwrite=overwrite)
         except (EmulatorError, OSError):

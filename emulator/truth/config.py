@@ -293,7 +293,7 @@ class LiveConfig(SocketConfig):
 
     kind: Literal["live"]
     protocol: Literal["udp", "tcp"] = "udp"
-    """Transport of the feed; of UDP, at most 2000 lines per second are read."""
+    """Transport of the feed; of UDP, lines that come too fast are dropped, the oldest first (2000 per second are not)."""
     host: str = "127.0.0.1"
     """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65535)] = 0

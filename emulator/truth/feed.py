@@ -7,6 +7,7 @@ import contextlib
 import logging
 import socket
 import time
+from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 from typing import Any, Final, Literal
@@ -18,10 +19,10 @@ from starhil.emulator.truth.json_lines import read_lines
 from starhil.emulator.truth.live import RESTART_S, LiveTruth
 from starhil.protocol.errors import reason
 from starhil.protocol.transports.connections import (
-    Account,
     Budget,
     ConnectionLimit,
     Listener,
+    limit_buffers,
     listen,
     stream_protocol,
 )
@@ -85,38 +86,28 @@ class LockStep:
 MAX_LINES: Final = 32
 """Most lines of a datagram."""
 
-MAX_LINES_PER_S: Final = 2000.0
-"""Most lines of datagrams per second, beyond a burst: the links of the device are served too."""
+MAX_WAITING: Final = 200
+"""Most lines of datagrams that wait while others are processed."""
 
-USUAL_S: Final = 1.25e-4
-"""Processor time of a usual line, seconds; one that takes longer counts as several, so that all take at most a quarter of the
-loop."""
-
-BURST: Final = 200.0
-"""Most lines of datagrams that may come at once."""
-
-
-READ_AGAIN: Final = 20.0
-"""Number of lines for which there must be room before datagrams are read again; the kernel drops what does not fit its buffer."""
-
-MAX_STALE: Final = 1000
-"""Most datagrams that are dropped when reading is taken up again."""
+TURN_S: Final = 0.0001
+"""Processor time after which a turn receives no further datagrams, and again after which it processes no further lines, seconds."""
 
 LONGEST_DATAGRAM: Final = 65536
 
 
 class _Datagrams:
-    """Passes each line of each datagram to the feed; if they come too fast, none is read for a while.
+    """Passes each line of each datagram to the feed, within the budget of its server; what comes too fast is dropped, the oldest first.
 
-    A datagram that is not read costs nothing; to receive and drop each one of a flood took half of the loop.
+    During a rest nothing is received, and the kernel drops what does not fit its buffer.
     """
 
-    def __init__(self, feed: LiveFeed, lines_per_s: float = MAX_LINES_PER_S) -> None:
+    def __init__(self, feed: LiveFeed, budget: Budget) -> None:
         self._feed = feed
-        self._lines_per_s = lines_per_s
-        self._room = BURST
-        """Number of lines that may come now."""
-        self._counted_s = time.monotonic()
+        self._account = budget.together
+        self._waiting: deque[list[bytes]] = deque()
+        """Lines of each datagram that has not been processed, the next one last."""
+        self.waiting = 0
+        """Number of these lines."""
         self._socket: socket.socket | None = None
         self._rest: asyncio.TimerHandle | None = None
 
@@ -132,7 +123,7 @@ class _Datagrams:
             source.close()
             raise
         self._socket = source
-        loop.add_reader(source, self._read, source)
+        loop.add_reader(source, self._turn, source)
         own: tuple[Any, ...] = source.getsockname()
         return own
 
@@ -145,51 +136,46 @@ class _Datagrams:
             self._socket.close()
             self._socket = None
 
-    def _read(self, source: socket.socket) -> None:
-        with contextlib.suppress(OSError):  # nothing is there after all
-            self.datagram_received(source.recv(LONGEST_DATAGRAM))
-        if self._room < 1.0:
-            loop = asyncio.get_running_loop()
+    def _turn(self, source: socket.socket) -> None:
+        """Receive what has come, and process lines until none waits, a rest is due, or it takes long."""
+        loop, begin_s = asyncio.get_running_loop(), time.thread_time()
+        with self._account.taking(), contextlib.suppress(OSError):  # nothing more is there
+            while time.thread_time() < begin_s + TURN_S:
+                self.add(source.recv(LONGEST_DATAGRAM))
+        until_s = None
+        while self.waiting and until_s is None:
+            with self._account.taking():
+                self.process_line()
+            until_s = self._account.rests_until_s()
+            if until_s is None and time.thread_time() >= begin_s + 2.0 * TURN_S:
+                until_s = loop.time()
+        if until_s is not None:
             loop.remove_reader(source)
-            pause_s = (READ_AGAIN - self._room) / self._lines_per_s
-            self._rest = loop.call_later(pause_s, self._read_again, source)
+            self._rest = loop.call_at(until_s, self._end_rest, source)
 
-    def _read_again(self, source: socket.socket) -> None:
-        """Drop what has waited, which is stale, and read again."""
-        self._rest = None
-        with contextlib.suppress(OSError):  # nothing more is there
-            for _ in range(MAX_STALE):
-                source.recv(1)
-                self._reject()
-        asyncio.get_running_loop().add_reader(source, self._read, source)
+    def _end_rest(self, source: socket.socket) -> None:
+        asyncio.get_running_loop().add_reader(source, self._turn, source)
+        self._turn(source)
 
-    def _reject(self) -> None:
-        self._feed.truth.reject(f"more than {self._lines_per_s:g} messages per second")
-
-    def datagram_received(self, data: bytes) -> None:
-        """Process a datagram."""
-        now_s = time.monotonic()
-        self._room = min(self._room + (now_s - self._counted_s) * self._lines_per_s, BURST)
-        self._counted_s = now_s
-        room, began_s = self._room, time.thread_time()
-        self._receive(data)
-        self._room = min(self._room, room - (time.thread_time() - began_s) / USUAL_S)
-
-    def _receive(self, data: bytes) -> None:
-        if self._room < 1.0:
-            self._reject()
-            return
+    def add(self, data: bytes) -> None:
+        """Add the lines of a datagram; if too many wait, the oldest datagrams are dropped."""
         lines = data.split(b"\n", MAX_LINES)
-        for line in lines[:MAX_LINES]:
-            if not line.strip():
-                continue
-            if self._room < 1.0:
-                self._reject()
-                return
-            self._room -= 1.0
-            self._feed.receive(line)
         if any(line.strip() for line in lines[MAX_LINES:]):
             self._feed.truth.reject(f"datagram of more than {MAX_LINES} lines")
+        self._waiting.append(lines[MAX_LINES - 1 :: -1])
+        self.waiting += len(self._waiting[-1])
+        while self.waiting > MAX_WAITING:
+            self.waiting -= len(self._waiting.popleft())
+            self._feed.truth.reject("messages come too fast; the oldest are dropped")
+
+    def process_line(self) -> None:
+        """Process the next line."""
+        line = self._waiting[0].pop()
+        self.waiting -= 1
+        if not self._waiting[0]:
+            self._waiting.popleft()
+        if line.strip():
+            self._feed.receive(line)
 
 
 class LiveFeed:
@@ -215,8 +201,6 @@ class LiveFeed:
         self._client: asyncio.Task[None] | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._limit = ConnectionLimit("truth feed")
-        self._turn = asyncio.Lock()
-        """Held by the connection whose message is next: many do not take the loop together."""
 
     async def start(self, kind: Socket, host: str, port: int) -> str:
         """Listen, or start connecting; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`."""
@@ -227,7 +211,7 @@ class LiveFeed:
         what = f"truth feed {protocol}:{host}:{port}: cannot listen"
         with explained(what, "choose another port, or 0", errors=(OSError, ValueError)):
             if kind == "udp":
-                self._datagrams = _Datagrams(self)
+                self._datagrams = _Datagrams(self, self._budget)
                 address = await self._datagrams.listen(host, port)
             else:
                 serve = until_cancelled(self._serve_connection)
@@ -251,7 +235,7 @@ class LiveFeed:
             self.receive(data)
             return ""
         self._message_received(data)
-        return await self._lock_step.receive(data)
+        return await asyncio.create_task(self._lock_step.receive(data))  # its step is not the sender's work
 
     def _message_received(self, data: bytes) -> None:
         if self._on_message is not None:
@@ -281,30 +265,26 @@ class LiveFeed:
         if not self._limit.admits(writer.transport, len(self._writers)):
             return
         self._writers.add(writer)
-        message_format = self.truth.format
+        limit_buffers(writer.transport)
         try:
-            with Account(self._budget) as account:
-                async for data in read_lines(
-                    reader, message_format.max_size, message_format.end, account=account
-                ):
-                    if data is None:
-                        self.truth.reject(self._too_long())
-                    else:
-                        async with self._turn:
-                            await self._answer(data, writer)
-                            await asyncio.sleep(0)
+            await self._budget.run(self._answer_messages(reader, writer))
         except ConnectionError:
             self.truth.reject("connection broken")
         finally:
             self._writers.discard(writer)
             writer.close()
 
-    async def _answer(self, data: bytes, writer: asyncio.StreamWriter) -> None:
-        """Process one message from a connection, and answer it if the sender expects this."""
-        fault = await self.process(data)
-        if self._lock_step is not None or self.truth.format.always_answers:
-            writer.write(self.truth.format.answer(self._now_s(), fault))
-            await writer.drain()
+    async def _answer_messages(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Process the messages of a connection, and answer each if the sender expects this."""
+        message_format = self.truth.format
+        async for data in read_lines(reader, message_format.max_size, message_format.end):
+            if data is None:
+                self.truth.reject(self._too_long())
+                continue
+            fault = await self.process(data)
+            if self._lock_step is not None or message_format.always_answers:
+                writer.write(message_format.answer(self._now_s(), fault))
+                await writer.drain()
 
     def close(self) -> None:
         """Stop listening and connecting."""

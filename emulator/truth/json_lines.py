@@ -9,9 +9,8 @@ from collections.abc import AsyncIterator
 from typing import Any, Final
 
 from starhil.protocol.errors import shortened
-from starhil.protocol.transports.connections import Account
 
-TURN: Final = 4096
+TURN: Final = 2048
 """Maximum number of bytes read before other tasks run."""
 
 
@@ -55,37 +54,27 @@ def _not_finite(value: object) -> float | None:
 
 
 async def read_lines(
-    reader: asyncio.StreamReader,
-    limit: int,
-    end: bytes = b"\n",
-    *,
-    account: Account,
-    within_s: float | None = None,
+    reader: asyncio.StreamReader, limit: int, end: bytes = b"\n", *, within_s: float | None = None
 ) -> AsyncIterator[bytes | None]:
     """Yield each line that is not blank until the peer closes; None for a line longer than `limit` bytes, which is dropped.
 
     A line that has begun must be complete within `within_s` seconds, or TimeoutError is raised; a peer may be silent between
-    lines. Other tasks run after each line and after each `TURN` bytes; then the peer rests if its account says so.
+    lines. Other tasks run after each line and after each `TURN` bytes.
     """
     rest, searched, too_long = bytearray(), 0, False
     late_s: float | None = None
     while True:
         async with asyncio.timeout_at(late_s):
             chunk = await reader.read(TURN)
-        lines: list[bytes | None] = []
-        with account.taking():
-            rest += chunk
-            while (at := rest.find(end, searched)) >= 0:
-                line = bytes(rest[: at + len(end)])
-                del rest[: len(line)]
-                if too_long or at > limit:
-                    lines.append(None)
-                elif not line[:at].isspace() and at:
-                    lines.append(line)
-                searched, too_long, late_s = 0, False, None
-        for each in lines:
-            yield each
-            await asyncio.sleep(0)
+        rest += chunk
+        while (at := rest.find(end, searched)) >= 0:
+            line = bytes(rest[: at + len(end)])
+            del rest[: len(line)]
+            blank = not at or line[:at].isspace()
+            if too_long or at > limit or not blank:
+                yield None if too_long or at > limit else line
+                await asyncio.sleep(0)
+            searched, too_long, late_s = 0, False, None
         if len(rest) >= limit + len(end):
             del rest[: len(rest) - len(end) + 1]  # which may be the begin of `end`
             too_long = True
@@ -96,7 +85,4 @@ async def read_lines(
         searched = max(0, len(rest) - len(end) + 1)
         if within_s is not None and late_s is None and (rest or too_long):
             late_s = asyncio.get_running_loop().time() + within_s
-        begin_s = asyncio.get_running_loop().time()
-        await account.rest()
-        if late_s is not None:
-            late_s += asyncio.get_running_loop().time() - begin_s
+        await asyncio.sleep(0)

@@ -263,7 +263,6 @@ def rounded_speed(speed: float) -> float:
 
 
 def _moved_on(last: TruthState, seconds: float) -> TruthState:
-    """Return a state propagated at its rate."""
     orbit = last.orbit
     return replace(
         last,

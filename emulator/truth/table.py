@@ -159,7 +159,6 @@ class FileTruth:
         return TruthState(self.attitudes[row], rate, orbit=orbit, unix_s=self._date(float(self.times_s[row])))
 
     def _within(self, span: Span, t: float) -> TruthState:
-        """Return the state at a time within a span."""
         if span.first == span.last:
             return self._row(span.first)
         low, fraction, length_s = _between(self.times_s[span.rows], t)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Self
 
 from starhil.protocol.can.frame import CanFrame, format_candump
-from starid.storage.files import check_links
+from starid.storage.files import open_output
 
 
 class WireLog:
@@ -25,8 +25,7 @@ class WireLog:
     def __init__(self, path: Path, bus: str = "", *, now: Callable[[], float] = time.time) -> None:
         self._bus = bus
         self._now = now
-        check_links(path)
-        self._file = path.open("w", encoding="utf-8", buffering=1)
+        self._file = open(path, "w", encoding="utf-8", buffering=1, opener=open_output)  # noqa: SIM115
         if not bus:
             self._write("# (seconds since 1970-01-01 UTC) TX = to the device, RX = from the device")
 

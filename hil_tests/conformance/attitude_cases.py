@@ -197,7 +197,6 @@ def mode_command(probe: Probe, mode: Value | None) -> Callable[[], None] | None:
 
 
 def changes_mode(telecommands: Iterable[Row]) -> bool:
-    """Return whether a telecommand sets the mode."""
     return any(row.action == "set_mode" for row in telecommands)
 
 

@@ -361,7 +361,6 @@ class CanopenProbe(Probe):
         return data
 
     def number(self, index: int, subindex: int = 0) -> int:
-        """Read an unsigned number."""
         return int.from_bytes(self.read(index, subindex), "little")
 
     def write(self, index: int, subindex: int, value: int | bytes, size: int = 4) -> int:
@@ -437,15 +436,12 @@ class CanopenProbe(Probe):
     # Rows, read and written by the entries that hold them
 
     def telecommands(self) -> Iterable[Row]:
-        """Return the telecommands that an entry executes."""
         return [entry.command for entry in self.entries if entry.command is not None and entry.part is None]
 
     def telemetry_rows(self) -> Iterable[Row]:
-        """Return the rows that entries read."""
         return {entry.row.name: entry.row for entry in self.entries if entry.row is not None}.values()
 
     def carries(self, row: Row, item: Field) -> bool:
-        """Return whether an entry reads a field of a row."""
         return any(slot.offset == item.offset for _, slot in slots(row, self.entries))
 
     def values(self, row: Row) -> dict[str, Value]:
@@ -536,7 +532,6 @@ def size_of(item: ODVariable) -> int | None:
 
 
 def encoded(item: ODVariable, number: int) -> bytes:
-    """Return the bytes of an integer in the type of a variable."""
     return number.to_bytes(size_of(item) or 1, "little", signed=item.data_type in datatypes.SIGNED_TYPES)
 
 

@@ -67,7 +67,6 @@ class Probe(ABC):
         """Return the telemetry that the link carries."""
 
     def carries(self, row: Row, item: Field) -> bool:  # noqa: ARG002 -- most links, every row whole
-        """Return whether the link carries a field of a row."""
         return True
 
     @abstractmethod
@@ -147,8 +146,6 @@ class CaseArea(Generic[ProbeType]):
     def case(
         self, name: str, title: str, clause: str | None = None, *, intrusive: bool | None = None
     ) -> Callable[[Callable[[ProbeType], None]], Callable[[ProbeType], None]]:
-        """Register a function as a case."""
-
         def register(run: Callable[[ProbeType], None]) -> Callable[[ProbeType], None]:
             source = self.clause if clause is None else clause
             changes = self.intrusive if intrusive is None else intrusive

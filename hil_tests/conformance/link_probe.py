@@ -164,7 +164,6 @@ class LinkProbe(Probe):
         return Answer("none", fault=f"late: {late} after {seconds:.1f} s; see --time-out" if late else "")
 
     def unexpected_answer(self, quiet_s: float) -> Answer:
-        """Return an unexpected answer within a time."""
         self.sleep(quiet_s)
         return self._answer_within(0.0) or Answer("none")
 
@@ -303,7 +302,6 @@ class LinkProbe(Probe):
         return checked_values(row, self.data_of(row))
 
     def telemetry(self, name: str) -> dict[str, Value]:
-        """Read a row by name."""
         row = self.unit.telemetry[name]
         return row.decode(self.data_of(row))
 

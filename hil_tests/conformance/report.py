@@ -26,7 +26,6 @@ TEMPLATE: Final = Path(__file__).with_name("report.html.j2")
 
 
 def count(outcomes: Sequence[Outcome], status: str) -> int:
-    """Return the number of cases with a status."""
     return sum(outcome.status == status for outcome in outcomes)
 
 
@@ -69,7 +68,6 @@ def by_area(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
 
 
 def print_summary(console: Console, outcomes: Sequence[Outcome]) -> None:
-    """Print a table by area."""
     table = Table("area", "cases", *STYLES, "seconds", box=None, pad_edge=False)
     for area, rows in by_area(outcomes).items():
         numbers = [len(rows), *(count(rows, status) for status in STYLES)]

@@ -188,7 +188,6 @@ def run_cases(
 
 
 def not_run(item: Case[Any], reason: str) -> Outcome:
-    """Return the outcome of a case that was not reached."""
     return replace(Outcome.of(item, CaseSkipped(f"not run: {reason}")), status=NOT_RUN)
 
 

@@ -43,7 +43,6 @@ Run = Callable[[SerialProbe], None]
 
 
 def serial_cases(unit: Unit) -> Iterator[Case[Any]]:
-    """Yield the cases for a unit with a serial link."""
     line = SerialLine(unit)
     if not unit.readable:
         yield from sent_cases(unit)

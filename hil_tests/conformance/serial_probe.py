@@ -109,7 +109,6 @@ class SerialProbe(LinkProbe):
     # --- answers ---
 
     def answers(self, row: Row) -> Sequence[str]:
-        """Return the answers of a row on the serial line."""
         return self.unit.serial_answers(row)
 
     @contextmanager

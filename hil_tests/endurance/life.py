@@ -371,7 +371,6 @@ class LifeGenerator:
         return value if parameter.type.startswith("f") else float(round(value))
 
     def _value(self, field: Field) -> Value:
-        """Return a value within the limits of a field."""
         chance = self._random.random()
         if field.argument in ("unix", "seconds") and chance < 0.5:
             low, high = field.limits

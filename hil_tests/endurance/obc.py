@@ -286,7 +286,8 @@ class Obc:
         """Send telemetry requests without waiting; the answers come in order."""
         if link == "canopen" or self._oracle.stuck or link in self._oracle.disturbed:
             return
-        known = [self._definition.by_key[message_class, row_id] for message_class, row_id, _ in rows]
+        by_key = self._definition.by_key
+        known = [by_key[key] for each in rows if (key := (each[0], each[1])) in by_key]  # of another unit
         answerable = [
             row for row in known if self._oracle.verdict(row, self._definition.request(row)) == "ok"
         ]
@@ -310,9 +311,9 @@ class Obc:
 
     async def cut(self, link: str, row: Sequence[Any], share: float) -> None:
         """Send the first part of a request, as a client that disconnects does; on a bus it must not be answered."""
-        if link in self._oracle.disturbed:
+        known = self._definition.by_key.get((row[0], row[1]))
+        if link in self._oracle.disturbed or known is None:
             return
-        known = self._definition.by_key[row[0], row[1]]
         content = b"" if known.is_telemetry else bytes(known.size)
         self._ports[link].cut(self._definition.request(known, content), share)
         if link != "serial":

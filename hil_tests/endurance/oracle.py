@@ -252,7 +252,6 @@ class Oracle:
         return None if parameter.name in _BOUND else "ok"
 
     def counted(self, request: Request) -> None:
-        """A request was received."""
         name = "telemetry" if request.telemetry else "telecommands"
         count = self.counts[name]
         self.counts[name] = None if count is None else (count + 1) & 0xFFFF

@@ -55,6 +55,14 @@ class LifeRun:
 
     async def run(self) -> Outcome:
         """Execute all steps, or those up to the first violation."""
+        try:
+            await self._live()
+        finally:
+            self._unit.set_disk(full=False)
+            await self._unit.power_off()
+        return self.outcome
+
+    async def _live(self) -> None:
         unit, outcome = self._unit, self.outcome
         try:
             await unit.power_on()
@@ -69,13 +77,9 @@ class LifeRun:
                     break
         except Violation as violation:
             outcome.violation = str(violation)
-        finally:
-            outcome.attitudes = self._oracle.attitudes.count
-            outcome.device_s = self._lived_s + unit.now_s
-            outcome.frames, outcome.exposed_s = unit.frames, unit.exposed_s
-            unit.set_disk(full=False)
-            await unit.power_off()
-        return outcome
+        outcome.attitudes = self._oracle.attitudes.count
+        outcome.device_s = self._lived_s + unit.now_s
+        outcome.frames, outcome.exposed_s = unit.frames, unit.exposed_s
 
     # --- time and power ---
 

@@ -245,7 +245,6 @@ def row_data(row: Row, found: Iterable[Entry], read: Callable[[Entry], bytes]) -
 
 
 def written(entry: Entry, command: Row, data: bytes) -> bytes:
-    """Return the bytes to be written to an entry to execute a telecommand with this data."""
     part = places(command)[0] if entry.part is None and len(places(command)) == 1 else entry.part
     if not data:
         return b"\x01"

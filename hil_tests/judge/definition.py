@@ -277,7 +277,6 @@ class PluginFraming:
         self._sizes = link.max_size or 1 << 16, link.timeout
 
     def encode(self, body: bytes) -> bytes:
-        """Return a body as bytes on the line."""
         line: bytes = self._framing.encode(body)
         return line
 

@@ -82,7 +82,6 @@ class Header:
         return sum(before[:number]), _size(model)
 
     def size(self, message_class: str) -> int:
-        """Return the bytes of the header in messages of a class."""
         return sum(_size(model) for model in self._in(message_class))
 
     def write(self, values: Mapping[str, int], message_class: str, data_size: int) -> bytes:

@@ -260,7 +260,6 @@ class Field:
 
 
 def single(number: float) -> float:
-    """Round to single precision."""
     return (
         float(struct.unpack("<f", struct.pack("<f", number))[0])
         if abs(number) <= LARGEST_OF_FORMAT["f32"]
@@ -328,7 +327,6 @@ class Row:
         return isinstance(self.unsolicited, float) or "frame" in (self.unsolicited or ())
 
     def example(self) -> dict[str, Value]:
-        """Return values that must be accepted."""
         return {name: item.plain for name, item in self.named.items()}
 
     def encode(self, values: Mapping[str, Value] | None = None) -> bytes:

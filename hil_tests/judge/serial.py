@@ -95,7 +95,6 @@ class SerialLine:
         self.clear()
 
     def request_format(self, message_class: str) -> tuple[Framing, Envelope]:
-        """Return framing and envelope of the requests of a class."""
         return _of_class(self._requests_in, message_class)[1:]
 
     def clear(self) -> None:
@@ -110,7 +109,6 @@ class SerialLine:
         return replace(request, sequence=self._requests * MIXING % (1 << self.envelope.sequence_bits))
 
     def encode(self, request: Request) -> bytes:
-        """Return a request as bytes on the line."""
         framing, envelope = self.request_format(request.message_class)
         return framing.encode(envelope.body(request))
 
@@ -124,7 +122,6 @@ class SerialLine:
         return line
 
     def telemetry_frame(self, body: bytes, message_class: str) -> bytes:
-        """Return the body of a telemetry answer as bytes on the line."""
         framing = _of_class(self._answers_in, message_class).framing
         if isinstance(framing, Escaped) and self.dialect == "c":
             return framing.encode(body, TELEMETRY)

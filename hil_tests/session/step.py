@@ -161,7 +161,6 @@ class Step(Keys):
                 )
 
     def judged(self, session: SessionState, reading: Reading) -> Attempt:
-        """Compare a reading with the expectations."""
         attempt = Attempt(
             detail=summarize(reading.values), values=reading.values, latency_s=reading.latency_s or None
         )

@@ -37,7 +37,7 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.values import Value
-from starid.storage.files import check_links
+from starid.storage.files import open_output
 
 CLOCK_GRAIN_S: Final = 1e-6
 
@@ -157,8 +157,9 @@ class Sample(ReadingStep):
         problems: list[str] = []
         last = Attempt()
         begin = time.monotonic()
-        check_links(session.folder / name)
-        with (session.folder / name).open("w", newline="", encoding="utf-8", buffering=1) as stream:
+        with open(
+            session.folder / name, "w", newline="", encoding="utf-8", buffering=1, opener=open_output
+        ) as stream:
             writer = csv.writer(stream)
             writer.writerow(["obc_time_s", "latency_ms", *fields])
             while time.monotonic() - begin < self.for_s or not latencies:

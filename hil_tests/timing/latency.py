@@ -213,7 +213,6 @@ def measure(
 async def _measure_links(
     icd: InterfaceDefinition, ready: Mapping[str, str], seconds: float, viewers: int
 ) -> dict[tuple[int, str], list[float]]:
-    """Return the latencies by number of viewers and link."""
     rows = [icd.telemetry[name] for name in REQUESTED_ROWS if name in icd.telemetry]
     turns = [0, viewers] * PAIRS if viewers else [0]
     taken: dict[tuple[int, str], list[float]] = {}

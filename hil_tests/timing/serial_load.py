@@ -52,13 +52,11 @@ class _SerialPipeline:
         return len(self._under_way)
 
     def next_request(self) -> bytes:
-        """Return the next request of the cycle as bytes."""
         request, size = self._cycle[self._next % len(self._cycle)]
         self._next += 1
         return self.request(request, size)
 
     def request(self, request: Request, size: int) -> bytes:
-        """Record a request as active and return it as bytes."""
         self._under_way.append((request, size))
         if len(self._under_way) == 1:
             return self._receiver.request(request)

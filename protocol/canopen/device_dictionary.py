@@ -331,7 +331,6 @@ class DeviceDictionary(Dictionary):
         self._holders[row.kind, row.name, None if slot is None else slot.index] = entry.key
 
     def _read_slot(self, entry: Entry, row: Row, slot: Slot) -> None:
-        """Let an entry read a slot of a telemetry row."""
         is_text = entry.variable.data_type == datatypes.VISIBLE_STRING
 
         def read() -> bytes:
@@ -368,7 +367,6 @@ class DeviceDictionary(Dictionary):
         return encode(item, getattr(self.application.image(name), attribute))
 
     def _narrowed(self, packed: PackedField, row: Row, slot: Slot, field: Field) -> int:
-        """Return a field of a telemetry row as a narrower integer."""
         data = self.row_bytes(row)
         if field.width:
             raw = int.from_bytes(data[span_of(slot)], slot.order)
@@ -409,7 +407,6 @@ def _no_data(_data: bytes = b"") -> NoReturn:
 
 
 def span_of(slot: Slot) -> slice:
-    """Return the bytes of a slot in its row."""
     return slice(slot.offset, slot.offset + slot.size)
 
 

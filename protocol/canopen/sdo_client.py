@@ -90,7 +90,6 @@ def requests_of(transfer: SdoTransfer) -> list[bytes]:
 
 
 def _checked(answer: bytes) -> bytes:
-    """Return an answer that is not an abort."""
     if answer[0] == _ABORT:
         raise SdoAbortError(int.from_bytes(answer[4:], "little"))
     return answer

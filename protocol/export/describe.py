@@ -36,7 +36,6 @@ def examples(icd: InterfaceDefinition) -> dict[str, list[Exchange]]:
 
 
 def example_text(exchange: Exchange) -> str:
-    """Describe an example exchange in one line."""
     request, answers = (
         ", ".join(f"`{frame}`" for frame in frames) for frames in (exchange.request, exchange.answers)
     )
@@ -69,7 +68,6 @@ def anchor(row: Row) -> str:
 
 
 def facts(row: Row) -> str:
-    """Return size and source of a row."""
     size = f"{row.size} byte{'' if row.size == 1 else 's'}" if row.size else "No data"
     sent = ", only sent" if row.only_sent else ""
     return f"{size}{sent}, {row.provenance}{f': {row.source}' if row.source else ''}"

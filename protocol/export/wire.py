@@ -185,7 +185,6 @@ def _header_cells(field: HeaderFieldModel, order: Order) -> Iterator[tuple[str, 
 
 
 def _counter(counts: list[CountedMessage]) -> str:
-    """Describe a number that counts messages."""
     return str(texts_of("counted")["".join(sorted(set(counts)))]) if counts else ""
 
 

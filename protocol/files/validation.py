@@ -51,7 +51,6 @@ class TableOf:
     model: type[BaseModel]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Validate by the model."""
         return core_schema.no_info_after_validator_function(
             lambda table: table.model_dump(exclude_unset=True),
             handler.generate_schema(self.model),

@@ -166,7 +166,6 @@ class InterfaceDefinition:
         return Request(self.kind_of(row_id, message_class), row_id, data, message_class=message_class)
 
     def error_number(self, code: ErrorCode) -> ErrorCode | int:
-        """Return the unit's code for an error."""
         if not self.errors:
             return code
         name = code.name.lower()

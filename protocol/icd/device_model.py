@@ -108,7 +108,6 @@ class DeviceModel:
         return _numbered(self.quantities.get(generic(name)), name)
 
     def near_quantities(self, name: str) -> str:
-        """Return a hint that names similar quantities."""
         return did_you_mean(name, [*self.quantities, *(PARAMETER + known for known in self.parameters)])
 
     def argument(self, action: ActionModel, name: str) -> ArgumentModel | None:

@@ -155,5 +155,4 @@ def _crc_table(width: int, poly: int, reflect: bool) -> tuple[int, ...]:
 
 
 def reversed_bits(value: int, bits: int) -> int:
-    """Return the lowest bits of a value in reverse order."""
     return int(f"{value:0{bits}b}"[::-1], 2)

@@ -368,7 +368,6 @@ class Stuffing:
         self._mask = 0 if model is None else model.mask
 
     def encode(self, body: bytes) -> bytes:
-        """Return a body with the bytes of the range stuffed."""
         if self._escape is None:
             return body
         stuffed = bytearray()

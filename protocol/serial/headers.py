@@ -78,7 +78,6 @@ class HeaderCodec:
         """Messages whose `sequence` the sender counts: `reply`, `unsolicited`."""
 
     def roles_in(self, message_class: str) -> frozenset[str]:
-        """Return the roles that the header carries in messages of a class."""
         return frozenset(
             role for field in self.fields if field.in_class(message_class) for role in field.by_role
         )

@@ -208,7 +208,6 @@ class SerialStack:
         return item
 
     def supports_unsolicited(self, dialect: Dialect | None = None) -> bool:
-        """Return whether this dialect has unsolicited telemetry."""
         replies = self.in_dialect(dialect)
         return replies is None or ReplyKind.UNSOLICITED in replies.headers
 
@@ -525,7 +524,6 @@ def dialects_of(link: SerialLinkModel | None) -> tuple[Dialect, ...]:
 
 
 def default_dialect(dialects: Sequence[Dialect]) -> Dialect | None:
-    """Return the dialect that is used if none is selected."""
     return dialects[0] if len(dialects) == 1 else Dialect.B if dialects else None
 
 

@@ -1,8 +1,8 @@
 """What peers without trust may take of an event loop: a budget of its time, turns, a limit of connections; and socket options for TCP.
 
-Each server has a `Budget`, accepts connections by `listen`, and passes what they send through a `Gate`, or counts its own
-processing with an `Account`. Without a limit on their number, connections could use up all file descriptors of the process,
-and links could not be reopened.
+Each server has a `Budget` and accepts connections by `listen`. What a protocol does is limited by a `Gate` for each connection,
+what a coroutine does by `Budget.run`. Without a limit on their number, connections could use up all file descriptors of the
+process, and links could not be reopened.
 """
 
 from __future__ import annotations
@@ -13,11 +13,15 @@ import logging
 import resource
 import socket
 import time
+import types
 from abc import abstractmethod
-from collections.abc import Awaitable, Callable, Iterator
-from typing import Final, Self, cast
+from collections.abc import Awaitable, Callable, Coroutine, Generator, Iterator
+from functools import partial
+from typing import Any, Final, TypeVar, cast
 
 log: Final = logging.getLogger("starhil.connections")
+
+Result = TypeVar("Result")
 
 TURN: Final = 4 * 1024
 """Maximum number of bytes that a connection of a server reads per turn of the loop: about 100 CAN frames as text."""
@@ -63,52 +67,35 @@ REFUSED_S: Final = 1.0
 """Pause after a connection that could not be accepted, seconds: the process has no free file descriptor."""
 
 
-class Budget:
-    """The time of the event loop that the connections of a server may take, and the order of their rests."""
-
-    def __init__(self) -> None:
-        self.accounts = 0
-        """Number of connections."""
-        self.resting = 0
-        """Number of connections from which nothing is read for now."""
-        self.rested_s = 0.0
-        """Time of the loop at which the last of them has rested, seconds."""
-
-    @property
-    def read_size(self) -> int:
-        """Number of bytes to read from a connection at a time: the fewer, the more there are that may send at once."""
-        return max(TURN // (1 + max(self.resting, self.accounts // 4)), LEAST_TURN)
-
-
 class Account:
-    """The time of the loop that a connection has taken from its server's budget; `with` it while the connection is open."""
+    """Processor time that a peer, or all peers of a server together, have taken of the loop beyond a free share of it.
 
-    def __init__(self, budget: Budget) -> None:
-        self.budget = budget
+    Parameters
+    ----------
+    budget
+        That of the server.
+    free_share
+        Returns the share of the loop that is free at present.
+    """
+
+    def __init__(self, budget: Budget, free_share: Callable[[], float]) -> None:
+        self._budget = budget
+        self._free_share = free_share
         self._taken_s = 0.0
-        """Processor time beyond the free share, seconds."""
         self._longest_s = 0.0
         self._counted_s = 0.0
 
-    def __enter__(self) -> Self:
-        self.budget.accounts += 1
-        return self
-
-    def __exit__(self, *_error: object) -> None:
-        self.budget.accounts -= 1
-
     @contextlib.contextmanager
-    def taking(self) -> Iterator[None]:
-        """Count the time of what is done inside, which must not await."""
+    def taking(self, beside_s: float = 0.0) -> Iterator[None]:
+        """Count the time of what is done inside, which must not await; `beside_s` is spent on it elsewhere, seconds."""
         loop = asyncio.get_running_loop()
         begin_s, began_s = loop.time(), time.thread_time()
         try:
             yield
         finally:
             now_s = loop.time()
-            free = min(FREE_SHARE, FREE_IN_ALL / max(self.budget.accounts, 1))
-            self._taken_s = max(self._taken_s - free * (now_s - self._counted_s), 0.0)
-            self._taken_s += time.thread_time() - began_s
+            self._taken_s = max(self._taken_s - self._free_share() * (now_s - self._counted_s), 0.0)
+            self._taken_s += time.thread_time() - began_s + beside_s
             self._longest_s = now_s - begin_s  # longer where other processes have the processor
             self._counted_s = now_s
 
@@ -118,20 +105,71 @@ class Account:
             return None
         now_s, taken_s = asyncio.get_running_loop().time(), max(self._taken_s, self._longest_s)
         self._taken_s = 0.0
-        self.budget.rested_s = max(self.budget.rested_s, now_s) + REST * taken_s
-        return self.budget.rested_s
+        self._budget.rested_s = max(self._budget.rested_s, now_s) + REST * taken_s
+        return self._budget.rested_s
 
-    async def rest(self) -> None:
-        """Let other tasks run, and rest if it is due."""
-        until_s = self.rests_until_s()
+
+class Budget:
+    """The time of the event loop that the peers of a server may take, the order of their rests, and their turns."""
+
+    def __init__(self) -> None:
+        self.accounts = 0
+        """Number of connections with an account of their own."""
+        self.resting = 0
+        """Number of connections from which nothing is read for now."""
+        self.rested_s = 0.0
+        """Time of the loop at which the last of them has rested, seconds."""
+        self.together = Account(self, lambda: FREE_IN_ALL)
+        """Account of all peers whose work is done in turns."""
+        self._turn = asyncio.Lock()
+
+    @property
+    def read_size(self) -> int:
+        """Number of bytes to read from a connection at a time: the fewer, the more there are that may send at once."""
+        return max(TURN // (1 + max(self.resting, self.accounts // 4)), LEAST_TURN)
+
+    def free_share(self) -> float:
+        """Return the share of the loop that a connection may take without rests."""
+        return min(FREE_SHARE, FREE_IN_ALL / max(self.accounts, 1))
+
+    async def run(self, work: Coroutine[Any, Any, Result], beside_s: float = 0.0) -> Result:
+        """Await a coroutine in turns: each of its steps, up to the next await that waits, is counted, and after it the loop is others'.
+
+        What the coroutine does in tasks of its own is not counted. `beside_s` is spent on the work elsewhere, seconds.
+        """
+        return await self._in_turns(work, beside_s)
+
+    @types.coroutine
+    def _in_turns(self, work: Coroutine[Any, Any, Result], beside_s: float) -> Generator[Any, Any, Result]:
+        resume: Callable[[], Any] = partial(work.send, None)
+        with contextlib.closing(work):
+            while True:
+                try:
+                    yield from self._turn.acquire().__await__()
+                except asyncio.CancelledError as error:
+                    resume = partial(work.throw, error)
+                    continue
+                try:
+                    with self.together.taking(beside_s):
+                        awaited = resume()
+                except StopIteration as end:
+                    result: Result = end.value
+                    return result
+                finally:
+                    self._end_turn()
+                beside_s = 0.0
+                try:
+                    resume = partial(work.send, (yield awaited))
+                except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 (it is for the coroutine)
+                    resume = partial(work.throw, error)
+
+    def _end_turn(self) -> None:
+        """Give the next peer its turn when the loop has served others, and the peers together have rested."""
+        loop, until_s = asyncio.get_running_loop(), self.together.rests_until_s()
         if until_s is None:
-            await asyncio.sleep(0)
-            return
-        self.budget.resting += 1
-        try:
-            await asyncio.sleep(until_s - asyncio.get_running_loop().time())
-        finally:
-            self.budget.resting -= 1
+            loop.call_soon(self._turn.release)
+        else:
+            loop.call_at(until_s, self._turn.release)
 
 
 class ConnectionLimit:
@@ -207,30 +245,30 @@ class Gate(TurnProtocol):
     ) -> None:
         self._make = make
         self._admits = admits
-        self._account = Account(budget)
+        self._budget = budget
+        self._account = Account(budget, budget.free_share)
         self._protocol = asyncio.Protocol()  # which ignores everything
         self._rest: asyncio.TimerHandle | None = None
-        """Its end, while nothing is read."""
-        self._paused = False
-        """Whether reading was paused for the rest, and not by the protocol."""
+        """Its end, during a rest."""
         self._held = b""
-        """What came in a rest because the protocol had resumed reading."""
+        """What came in a rest; reading is paused then, unless the protocol resumes it."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
-        self._account.__enter__()
+        self._budget.accounts += 1
         if self._admits(transport):
             self._protocol = cast("asyncio.Protocol", self._make())
             self._protocol.connection_made(transport)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._account.__exit__()
+        self._budget.accounts -= 1
         if self._rest is not None:
             self._rest.cancel()
-            self._account.budget.resting -= 1
+            self._budget.resting -= 1
         self._protocol.connection_lost(exc)
 
     def eof_received(self) -> bool | None:
+        self._pass_held()
         return self._protocol.eof_received()
 
     def pause_writing(self) -> None:
@@ -240,39 +278,36 @@ class Gate(TurnProtocol):
         self._protocol.resume_writing()
 
     def get_buffer(self, sizehint: int) -> bytearray:
-        self.read_size = self._account.budget.read_size
+        self.read_size = self._budget.read_size
         return super().get_buffer(sizehint)
 
     def data_received(self, data: bytes) -> None:
         """Pass on what was read; a connection that takes much of the loop then rests, behind those that rest already."""
         if self._rest is not None:
             self._held += data
-            self._pause()
-            return
+            self._transport.pause_reading()
+        else:
+            self._pass_on(data)
+
+    def _pass_on(self, data: bytes) -> None:
         with self._account.taking():
             self._protocol.data_received(data)
         until_s = self._account.rests_until_s()
-        if until_s is not None and not self._transport.is_closing():
-            self._account.budget.resting += 1
+        if until_s is not None and self._rest is None and not self._transport.is_closing():
+            self._budget.resting += 1
             self._rest = asyncio.get_running_loop().call_at(until_s, self._end_rest)
-            if self._transport.is_reading():
-                self._pause()
-
-    def _pause(self) -> None:
-        self._transport.pause_reading()
-        self._paused = True
 
     def _end_rest(self) -> None:
         self._rest = None
-        self._account.budget.resting -= 1
-        if self._transport.is_closing():
-            return
-        if self._paused:
-            self._paused = False
+        self._budget.resting -= 1
+        if self._held and not self._transport.is_closing():
             self._transport.resume_reading()
-        if self._held:
-            data, self._held = self._held, b""
-            self.data_received(data)
+            self._pass_held()
+
+    def _pass_held(self) -> None:
+        data, self._held = self._held, b""
+        if data:
+            self._pass_on(data)
 
 
 class Listener:
@@ -285,32 +320,53 @@ class Listener:
         self._make = make
         self.address = server.sockets[0].getsockname()
         """Address of the first socket."""
-        self._sockets = [each.dup() for each in server.sockets]
-        for each in self._sockets:
-            each.listen(backlog)
-        self._tasks = [asyncio.create_task(self._accept(each)) for each in self._sockets]
+        self._loop = asyncio.get_running_loop()
+        self._pauses: dict[socket.socket, asyncio.TimerHandle | None] = {}
+        """Sockets, each with the end of its pause."""
+        self._connecting: set[asyncio.Task[Any]] = set()
+        for each in server.sockets:
+            own = each.dup()
+            self._pauses[own] = None
+            own.listen(backlog)
+            self._end_pause(own)
 
-    async def _accept(self, listening: socket.socket) -> None:
-        loop = asyncio.get_running_loop()
-        while True:
-            try:
-                connection, _ = await loop.sock_accept(listening)
-                await loop.connect_accepted_socket(self._make, connection)
-            except ConnectionError:  # it has closed already
-                pass
-            except OSError as error:
-                loop.call_exception_handler(
-                    {"message": "a connection cannot be accepted", "exception": error}
-                )
-                await asyncio.sleep(REFUSED_S)
-            await asyncio.sleep(ACCEPTING_S)
+    def _end_pause(self, listening: socket.socket) -> None:
+        self._pauses[listening] = None
+        self._loop.add_reader(listening, self._accept, listening)
+
+    def _accept(self, listening: socket.socket) -> None:
+        pause_s = ACCEPTING_S
+        try:
+            connection, _ = listening.accept()
+        except (BlockingIOError, ConnectionError):  # it has closed already
+            pass
+        except OSError as error:
+            pause_s = REFUSED_S
+            self._loop.call_exception_handler(
+                {"message": "a connection cannot be accepted", "exception": error}
+            )
+        else:
+            connection.setblocking(False)  # noqa: FBT003 (the call of the library)
+            connecting = self._loop.create_task(self._loop.connect_accepted_socket(self._make, connection))
+            self._connecting.add(connecting)
+            connecting.add_done_callback(self._connected)
+        self._loop.remove_reader(listening)
+        self._pauses[listening] = self._loop.call_later(pause_s, self._end_pause, listening)
+
+    def _connected(self, connecting: asyncio.Task[Any]) -> None:
+        self._connecting.discard(connecting)
+        if not connecting.cancelled():
+            connecting.exception()  # it has closed already
 
     def close(self) -> None:
         """Stop listening; connections stay open."""
-        for task in self._tasks:
-            task.cancel()
-        for each in self._sockets:
-            each.close()
+        for listening, pause in self._pauses.items():
+            if pause is None:
+                self._loop.remove_reader(listening)
+            else:
+                pause.cancel()
+            listening.close()
+        self._pauses.clear()
         self._server.close()
 
 
@@ -321,7 +377,9 @@ def stream_protocol(
     return lambda: asyncio.StreamReaderProtocol(asyncio.StreamReader(), serve)
 
 
-async def listen(make: Callable[[], asyncio.BaseProtocol], host: str, port: int, backlog: int) -> Listener:
+async def listen(
+    make: Callable[[], asyncio.BaseProtocol], host: str, port: int, backlog: int = MAX_CONNECTIONS
+) -> Listener:
     """Listen on TCP; `make` makes the protocol of a connection.
 
     Raises OSError or UnicodeError if the address is not available.
@@ -335,7 +393,7 @@ async def listen(make: Callable[[], asyncio.BaseProtocol], host: str, port: int,
 
 
 def limit_buffers(transport: asyncio.BaseTransport) -> None:
-    """Limit the kernel buffers of a TCP connection, which hold megabytes by default."""
+    """Limit the kernel buffers of a connection, which hold megabytes by default, also of a peer that has flooded it and gone."""
     for option in (socket.SO_SNDBUF, socket.SO_RCVBUF):
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, option, WINDOW)
 

@@ -241,8 +241,8 @@ class _Client(asyncio.Protocol):
 class CanHub:
     """The server: after `await start()`, clients may connect to `host:port` until `await close()`.
 
-    With port 0, `start` chooses a free one. `log` is a candump log of all frames, `now` the clock for timestamps (s since
-    1970).
+    With port 0, `start` chooses a free one. `log` is a candump log of all frames, opened by `opener`, and `now` the clock for
+    timestamps (s since 1970).
     """
 
     def __init__(
@@ -251,6 +251,7 @@ class CanHub:
         port: int = DEFAULT_PORT,
         *,
         log: Path | None = None,
+        opener: Callable[[str, int], int] | None = None,
         now: Callable[[], float] = time.time,
     ) -> None:
         self.host: Final = host
@@ -258,6 +259,7 @@ class CanHub:
         self.statistics: Final = HubStatistics()
         self.limit: Final = ConnectionLimit("CAN hub", b"< error too many clients >")
         self._log_path = log
+        self._opener = opener
         self._log: TextIO | None = None
         self._now = now
         self._listener: Listener | None = None
@@ -285,8 +287,8 @@ class CanHub:
         self.port = self._listener.address[1]
         if self._log_path is not None:
             try:
-                self._log = self._log_path.open(
-                    "w", encoding="ascii", buffering=1
+                self._log = open(  # noqa: SIM115 (a path has no opener; closed with the hub)
+                    self._log_path, "w", encoding="ascii", buffering=1, opener=self._opener
                 )  # a batch is written at once
             except OSError as error:
                 await self.close()

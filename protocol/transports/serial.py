@@ -15,7 +15,7 @@ import serial
 
 from starhil.protocol.errors import reason
 from starhil.protocol.transports.base import ReconnectingTransport, TransportError
-from starhil.protocol.transports.connections import TurnProtocol, detect_lost_peer
+from starhil.protocol.transports.connections import Listener, TurnProtocol, detect_lost_peer, listen
 from starhil.protocol.transports.paced import (
     PacedTransport,
     SerialTransport,
@@ -258,24 +258,23 @@ class _ListenTransport(_TcpTransport):
     """A TCP port for one peer at a time, which rejects a second one; without a peer, bytes are lost as on an open line."""
 
     scheme = "listen"
-    _server: asyncio.Server | None = None
+    _listener: Listener | None = None
 
     async def _open(self) -> None:
-        loop = asyncio.get_running_loop()
         try:
-            self._server = await loop.create_server(lambda: self, self._host, self._port)
+            self._listener = await listen(lambda: self, self._host, self._port)
         except (OSError, ValueError) as error:
             raise TransportError(
                 f"serial {self.description}: cannot listen: {reason(error)}; choose another host or port"
             ) from None
-        self._port = self._server.sockets[0].getsockname()[1]
+        self._port = self._listener.address[1]
         self.description = f"socket://{self._host}:{self._port}"
 
     def _peer_gone(self, why: str) -> None:  # noqa: ARG002 (the peer may come and go)
         self._clear()
 
     def _disconnect(self) -> None:
-        if self._server is not None:
-            self._server.close()
-            self._server = None
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
         super()._disconnect()

@@ -54,7 +54,7 @@ def command(
     from starid.catalog import DEFAULT_EPOCH, load_catalog
     from starid.photograph.self_calibration import self_calibrate
 
-    prepare_output(output, "-o")
+    prepare_output(output, "-o", images)
     frames, (height, width) = _stars(images, allow_colour=allow_colour)
     start = Camera.from_dict({"fov_deg": fov, "width": width, "height": height, "model": model})
     catalog = load_catalog(epoch=DEFAULT_EPOCH if epoch is None else epoch)

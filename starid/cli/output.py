@@ -46,30 +46,39 @@ _PLAIN: Final = {
 
 _HANDLER: Final = "starhil-plain"
 
-_COMPILING_EVERY_S: Final = 5.0
-"""Time after which compiling is reported, and between reports, seconds."""
+PROGRESS_S: Final = 5.0
+"""Time after which the progress of compiling is reported, and between reports, seconds."""
 
 
 @contextmanager
-def compiling_reported(module: str) -> Iterator[None]:
-    """Meanwhile, report on stderr how many kernels of a module are compiled, as long as their number grows."""
+def compiling_reported(modules: Iterable[str], *, start: bool = False) -> Iterator[None]:
+    """Meanwhile, report on stderr how many kernels of some modules are compiled, whenever the number has grown.
+
+    Of a `start`, the time that it takes is reported too, also if nothing is compiled.
+    """
     ended = threading.Event()
 
     def report() -> None:
-        begin_s = time.monotonic()
-        if ended.wait(_COMPILING_EVERY_S):
+        begin_s, begin_unix_s = time.monotonic(), time.time()
+        if ended.wait(PROGRESS_S):
             return
         from starid.kernels.compile_progress import CompileProgress
+        from starid.storage import cache
 
-        progress = CompileProgress([module])
-        compiled = progress.compiled()
-        while not ended.wait(_COMPILING_EVERY_S):
-            before, compiled = compiled, progress.compiled()
-            if compiled > before:
-                print(
-                    f"compiling: {time.monotonic() - begin_s:.0f} s, {compiled} of {len(progress.kernels)} kernels; later runs "
-                    "use them", file=sys.stderr, flush=True,
-                )  # fmt: skip
+        progress, written, compiled = None, 0, ""
+        while True:
+            before, written = written, cache.kernels_written_since(begin_unix_s)
+            if written > before:
+                progress = progress or CompileProgress(modules)
+                at_most = len(progress.kernels)  # some options need fewer
+                compiled = (
+                    f", {progress.compiled()} of at most {at_most} kernels compiled; later runs use them"
+                )
+            if start or written > before:
+                what = "starting" if start else "compiling"
+                print(f"{what}: {time.monotonic() - begin_s:.0f} s{compiled}", file=sys.stderr, flush=True)
+            if ended.wait(PROGRESS_S):
+                return
 
     threading.Thread(target=report, daemon=True).start()
     try:
@@ -83,16 +92,21 @@ def output_help(what: str) -> str:
     return f"{what} Missing folders are created; /dev/stdout is standard output."
 
 
-def prepare_output(path: Path, option: str) -> Path:
+def prepare_output(path: Path, option: str, sources: Iterable[Path | None] = ()) -> Path:
     """Create the folder of an output file, so that an invalid path fails before the work starts.
 
     Raises
     ------
     StaridError
-        The folder cannot be created, or the path is a folder, or a link of another user.
+        The folder cannot be created, or the path is a folder, or a link of another user, or one of the sources, the files that
+        are read.
     """
     if path.is_dir():
         raise StaridError(f"{path}: is a folder; name a file with {option}")
+    if path.is_file() and any(
+        source is not None and source.exists() and path.samefile(source) for source in sources
+    ):
+        raise StaridError(f"{path}: is a file that is read; name another one with {option}")
     try:
         check_links(path)
     except PermissionError as error:

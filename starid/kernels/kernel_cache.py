@@ -24,7 +24,15 @@ import zlib
 from pathlib import Path
 from typing import Final
 
-from starid.storage.cache import KERNEL_SUFFIX, cache_dir, evict, kernel_folder, make_kernel_folder, mark_used
+from starid.storage.cache import (
+    CACHED_MODE,
+    KERNEL_SUFFIX,
+    cache_dir,
+    evict,
+    kernel_folder,
+    make_kernel_folder,
+    mark_used,
+)
 from starid.storage.files import write_atomically
 from starid.storage.temporary_folder import locked, make_temporary_folder
 from starid.storage.working_folder import check_working_folder
@@ -141,7 +149,9 @@ def record_checksums(folder: Path, since_s: float = 0.0) -> None:
         if current == checksums:
             return
         try:
-            write_atomically(folder / _CHECKSUMS, lambda part: part.write_text(json.dumps(current)))
+            write_atomically(
+                folder / _CHECKSUMS, lambda part: part.write_text(json.dumps(current)), mode=CACHED_MODE
+            )
         except OSError as error:
             _log.warning("%s: cannot be written (%s): kernels are compiled again", folder, error.strerror)
     evict(keep=folder)

@@ -33,6 +33,8 @@ DEFAULT_LIMIT_MB: Final = 500.0
 BYTES_PER_MB: Final = 1_000_000
 _PRIVATE: Final = 0o700
 _READABLE: Final = 0o755
+CACHED_MODE: Final = 0o644
+"""Mode of a cached file: nobody else may write to it, whatever the umask."""
 _KERNELS: Final = "kernels"
 KERNEL_SUFFIX: Final = ".nbc"
 _OWN_NAME: Final = re.compile(
@@ -358,7 +360,7 @@ def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
             np.savez(stream, allow_pickle=False, **tables)
 
     try:
-        write_atomically(path, write)
+        write_atomically(path, write, mode=CACHED_MODE)
         evict(keep=path)
     except OSError as error:
         _log.warning("cache file %s cannot be written (%s): computed again each time", path, error)

@@ -11,6 +11,7 @@ import errno
 import math
 import os
 import re
+import secrets
 import shutil
 import stat
 import sys
@@ -29,6 +30,9 @@ STDOUT: Final = 1
 
 _MOST_LINKS: Final = 40
 """Number of links that Linux follows one after the other."""
+
+_ANY_MODE: Final = 0o666
+"""Mode of a new file, unless the umask takes some of it."""
 
 _NUMBER: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
@@ -135,33 +139,57 @@ def open_stream(path: str | Path) -> BinaryIO:
         It cannot be opened.
     """
     if not is_stdout(path):
-        return Path(path).open("wb")
+        return open(path, "wb", opener=open_output)
     if sys.stdout is not None:
         sys.stdout.flush()
     return os.fdopen(os.dup(STDOUT), "wb")
 
 
-def check_links(path: str | Path) -> None:
+def check_links(path: str | Path) -> Path:
     """Check that a file to write is not a link of another user, as in /tmp: it could lead to any file of this one.
+
+    Return the file to which own links and those of root lead, which may be missing.
 
     Raises
     ------
     PermissionError
-        It is.
+        It is a link of another user.
     """
     for _ in range(_MOST_LINKS):
+        path = Path(path)
         try:
             status = os.lstat(path)
         except (OSError, ValueError):  # there is none, or it cannot be written either
-            return
-        if sys.platform == "win32" or not stat.S_ISLNK(status.st_mode):
-            return
+            return path
+        if sys.platform == "win32" or not stat.S_ISLNK(status.st_mode) or _is_of_the_kernel(path):
+            return path
         if status.st_uid not in (os.geteuid(), 0):
             raise PermissionError(errno.EPERM, f"a link that user {status.st_uid} has made", str(path))
-        path = Path(path).parent / Path(path).readlink()
+        path = path.parent / path.readlink()
+    return Path(path)
 
 
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+def _is_of_the_kernel(path: Path) -> bool:
+    """Whether a path is in /proc, whose links to open files have no path as their target."""
+    return path.is_relative_to("/proc")
+
+
+def open_output(path: str | Path, flags: int) -> int:
+    """Open a file for writing, with `flags` of `os.open`; a link that another user makes meanwhile is not followed.
+
+    An `opener` for Python's `open`. The mode of a new file is what the umask leaves.
+
+    Raises
+    ------
+    OSError
+        The file cannot be opened, or is a link of another user.
+    """
+    target = check_links(path)
+    follow = 0 if _is_of_the_kernel(target) else getattr(os, "O_NOFOLLOW", 0)
+    return os.open(target, flags | follow, _ANY_MODE)
+
+
+def write_atomically(path: Path, write: Callable[[Path], object], *, mode: int = _ANY_MODE) -> None:
     """Write a file by filling a temporary one and renaming it.
 
     Where `path` is a link, its target is replaced. A device, pipe or standard output gets the complete
@@ -173,6 +201,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         Final name; missing folders are created.
     write : callable
         Called with the temporary path. If it raises, the temporary file is removed and `path` is untouched.
+    mode : int
+        Mode of a new file, of which the umask may take some; a file that is replaced keeps its own.
 
     Raises
     ------
@@ -192,12 +222,12 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     target = Path(os.path.realpath(path))
     with removing_new_folders_on_error(target.parent):
         target.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".part", dir=target.parent)
-        os.close(descriptor)
-        part = Path(name)
+        part = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+        os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode))
         try:
             write(part)
-            part.chmod(0o644)
+            with contextlib.suppress(FileNotFoundError):  # a new file
+                part.chmod(stat.S_IMODE(target.stat().st_mode))
             part.replace(target)
         finally:
             part.unlink(missing_ok=True)

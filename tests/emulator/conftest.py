@@ -241,6 +241,12 @@ def run(monkeypatch, make_bench):
     return run
 
 
+@pytest.fixture
+def prompt_pages(monkeypatch):
+    """Send the pages of a console their turns without a pause, for tests that ask much and do not look at the pace."""
+    monkeypatch.setattr("starhil.emulator.console.viewer.PAUSE_S", 0.0)
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     """Mark the tests that start workers."""

@@ -247,7 +247,8 @@ def test_a_request_that_is_not_http_is_answered_and_not_logged(run, caplog, requ
     async def scenario(emulation, _line):
         reader, writer = await asyncio.open_connection("127.0.0.1", view_port(emulation))
         writer.write(request_)
-        assert (await asyncio.wait_for(reader.read(), PATIENCE_S)).startswith(b"HTTP/1.0 400 ")
+        # the line only: the connection is reset after it if some of the request has not been read
+        assert (await asyncio.wait_for(reader.readline(), PATIENCE_S)).startswith(b"HTTP/1.0 400 ")
         writer.close()
 
     run(scenario, options=OPTIONS)

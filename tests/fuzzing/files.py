@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from starhil.emulator.cli.endurance import read_life
+from starhil.emulator.cli.life_file import read_life
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.launch.recording import read_run
@@ -158,7 +158,16 @@ TARGETS["recording-tape"] = of_document(
 )
 TARGETS["life"] = of_document(
     "life.json",
-    lambda: {"links": ["serial"], "steps": [["send", 1, "00"]], "unit": "nos3", "seed": 1, "profile": {}},
+    lambda: {
+        "links": ["serial"],
+        "steps": [
+            {"do": "request", "link": "serial", "row": ["", 1, "telemetry"], "data": "00"},
+            {"do": "fault", "fault": {"serial": {"drop": 0.5}}},
+        ],
+        "unit": "nos3",
+        "seed": 1,
+        "profile": {},
+    },
     as_json,
     read_life,
 )

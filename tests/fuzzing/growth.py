@@ -29,7 +29,7 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.can.socketcand import format_send
 from starhil.protocol.errors import OneLineError
 from starhil.protocol.serial.stack import SerialStack
-from starhil.protocol.transports.connections import TURN
+from starhil.protocol.transports.connections import TURN, Budget
 from starhil.protocol.transports.hub import CanHub, _Client
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
@@ -214,8 +214,14 @@ def _canopen(unit: str) -> Channel:
 
 def _feed(form: Any, messages: list[bytes]) -> Channel:
     feed = LiveFeed(LiveTruth(Attitude.identity(), message_format=form), lambda: 1.0)
-    datagrams = _Datagrams(feed, lines_per_s=1e12)
-    return Channel(messages, lambda data: datagrams.datagram_received(data))
+    datagrams = _Datagrams(feed, Budget())
+
+    def process(data: bytes) -> None:
+        datagrams.add(data)
+        while datagrams.waiting:
+            datagrams.process_line()
+
+    return Channel(messages, process)
 
 
 def _whole(form: Format42) -> Channel:

@@ -13,6 +13,7 @@ import pytest
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, hub_command, installed_command
 from tests.emulator.cli.command_line import run_command_line
+from tests.users import OTHER_USER, needs_others
 
 pytestmark = pytest.mark.process
 
@@ -55,7 +56,7 @@ def test_the_processes_of_a_pool_import_nothing_from_the_working_directory(was_r
     assert (done.returncode, was_run.exists()) == (0, False), done.stderr
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file to another user")
+@needs_others
 @pytest.mark.parametrize("name", [".numba_config.yaml", "matplotlibrc"])
 def test_settings_of_libraries_that_another_user_has_put_there_are_not_obeyed(tmp_path, monkeypatch, name):
     """With `chrome_trace`, numba replaced any file of the user by a trace."""
@@ -68,7 +69,7 @@ def test_settings_of_libraries_that_another_user_has_put_there_are_not_obeyed(tm
         [installed_command(), "unit", "list"],
         [str(Path(installed_command()).with_name("starid")), "--help"],
     ]
-    os.chown(settings, 12345, 12345)
+    os.chown(settings, OTHER_USER, OTHER_USER)
     for command in [uses_numba, *commands]:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 1

@@ -41,7 +41,7 @@ def export(
     where, around = (
         str(Path(each).absolute()) if each.endswith(".toml") else each for each in (name, orbit or "")
     )
-    with writing(output):
+    with writing(output, map(Path, (name, orbit or ""))):
         export_fmu(output, where, around, installed_command(), cast("Fmi", fmi))
 
 

@@ -35,7 +35,6 @@ class Variable:
     """Key of an output in a row of the truth log; empty if it is the name."""
 
     def kind(self, fmi: Fmi) -> str:
-        """Return the name of the type."""
         return TYPES[type(self.start)][fmi]
 
 

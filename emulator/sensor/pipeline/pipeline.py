@@ -264,7 +264,6 @@ class Pipeline:
         return found, exposure.false_stars(found.xy_px)
 
     def identifier(self, request: FrameRequest) -> StarIdentifier:
-        """Return the star identifier for the parameters of a request."""
         return self._identifiers.build(self._identifier_setup(request))
 
     def solution(

@@ -251,7 +251,6 @@ def _planets_of(slot: int) -> tuple[Vector, Vector, tuple[float, ...]]:
 
 
 def _planet_magnitude(observer: Observer, place_m: Vector, name: str, law: tuple[float, ...]) -> float:
-    """V magnitude of a planet at a barycentric place."""
     to_observer, to_sun = observer.position_m - place_m, observer.sun - place_m
     distance, sun_distance = _length(to_observer), _length(to_sun)
     phase = math.degrees(_angle(to_observer / distance, to_sun / sun_distance))

@@ -154,7 +154,6 @@ def _left_by_baffle(sun: SunGlare, attitude: Attitude) -> float:
 
 
 def _chord(angle_rad: float) -> float:
-    """Chord of an angle on the unit circle."""
     return 2.0 * sin(0.5 * angle_rad)
 
 
@@ -200,7 +199,6 @@ class AreaPainter:
         return self._camera.width, self._camera.height
 
     def paint(self, objects: SkyObjects, attitude: Attitude) -> AreaLight:
-        """Return light and transmission of all extended objects at one attitude."""
         if not objects.blank and through_baffle(objects, attitude):
             return AreaLight(self._size, flooded=True)
         sun, earth = objects.sun, objects.earth
@@ -230,7 +228,6 @@ class AreaPainter:
         return disc_in_field(attitude.to_sensor(body.direction), radius_rad, self._camera)
 
     def _glare(self, body: SunGlare | Moon, attitude: Attitude) -> Glare:
-        """Return the stray light of a body."""
         direction = attitude.to_sensor(body.direction)
         outside = math.radians(_off_axis_deg(attitude, body)) - self._camera.field_radius_rad
         nearest = _chord(max(outside, 0.0))

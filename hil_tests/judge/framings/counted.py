@@ -36,7 +36,6 @@ class Counted:
         self.marks = self.start + special + self.end or b"\x1f\x7f\xff"
 
     def encode(self, body: bytes) -> bytes:
-        """Return the body between its marks."""
         return self.start + b"".join(self._pairs.get(byte, bytes((byte,))) for byte in body) + self.end
 
     def take(self, received: bytearray, measure: Measure) -> Taken | None:

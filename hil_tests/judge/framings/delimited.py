@@ -20,7 +20,6 @@ class Delimited:
         self.marks = self.start + self.end
 
     def encode(self, body: bytes) -> bytes:
-        """Return the body between its delimiters."""
         text = "".join(f"{byte:02X}" for byte in body).encode() if self._hex else body
         return self.start + text + self.end
 

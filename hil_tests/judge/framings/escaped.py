@@ -21,7 +21,6 @@ class Escaped:
         self.marks = bytes((escape, starts[0], end))
 
     def encode(self, body: bytes, start: int | None = None) -> bytes:
-        """Return the body between its marks."""
         line = bytearray((self._escape, self._starts[0] if start is None else start))
         for byte in body:
             line += bytes((byte,)) * (2 if byte == self._escape else 1)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.identification.geometric.pattern_index import IndexArrays
+from starid.storage.cache import CACHED_MODE
 from starid.storage.files import write_atomically
 
 _log = logging.getLogger(__name__)
@@ -87,7 +88,7 @@ def store(path: Path, arrays: IndexArrays, key: str) -> IndexArrays:
     """Write an index file and map it; if that fails, the index stays in memory."""
     content = pack(arrays, key)
     try:
-        write_atomically(path, lambda part: _write(part, content))
+        write_atomically(path, lambda part: _write(part, content), mode=CACHED_MODE)
     except OSError as error:
         _log.warning("index file %s cannot be written (%s): built again each time", path, error)
         return unpack(content, key)

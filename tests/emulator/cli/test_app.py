@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 
 from starhil.emulator.cli import app
 from starhil.emulator.cli.run import DeviceOptions
+from starhil.protocol.files.bundled import find_unit
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.workers import NEVER_READY
 
@@ -74,6 +76,29 @@ def test_a_folder_given_as_a_file_is_named(
     assert caught.value.code == 2
     assert printed.out == ""
     assert printed.err == f"starhil: {folder}: is a folder; name a file with -o\n"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("truth", "convert", "truth.csv", "--date", "2026-01-01T00:00:00Z", "-o", "truth.csv"),
+        ("icd", "export", "markdown", "--unit", ".", "-o", "nos3.toml"),
+        ("replay", ".", "--csv", "truth.csv"),
+    ],
+)
+def test_no_command_writes_over_what_it_reads(
+    arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`truth convert` replaced its source."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(find_unit("nos3") / "nos3.toml", tmp_path)
+    Path("truth.csv").write_text("t,qx,qy,qz,qw\n0,0,0,0,1\n1,0,0,0,1\n")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    status, out, err = run_command_line(*arguments)
+    assert (status, out) == (2, "")
+    option = "--csv" if "--csv" in arguments else "-o"
+    assert err == f"starhil: {arguments[-1]}: is a file that is read; name another one with {option}\n"
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 @pytest.mark.parametrize(

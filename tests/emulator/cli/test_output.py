@@ -5,8 +5,10 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -181,7 +183,7 @@ def slow_worker(worker: Callable[..., object], monkeypatch: pytest.MonkeyPatch, 
     waits = f"import pathlib, time\nwhile not pathlib.Path({str(gate)!r}).exists():\n    time.sleep(0.01)\n"
     worker(WORKER + waits + "send(Failure('no catalogue'))\n")
     monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(output, "PROGRESS_S", 0.05)
+    monkeypatch.setattr("starid.cli.output.PROGRESS_S", 0.05)
     return gate
 
 
@@ -204,6 +206,37 @@ def test_a_slow_start_reports_its_progress_on_stderr(
     assert (status, out) == (2, "")
     first, second, *_, last = said.splitlines()
     total = len(kernels_of([output.PIPELINE, ALGORITHMS["geometric"].module]))
-    assert first == "starting: 0 s"
-    assert second == f"starting: 0 s, 20 of at most {total} kernels compiled; later starts use them"
+    assert re.fullmatch(r"starting: \d+ s", first)
+    assert re.fullmatch(
+        rf"starting: \d+ s, 20 of at most {total} kernels compiled; later runs use them", second
+    )
     assert last.endswith("no catalogue")
+
+
+@pytest.mark.parametrize(
+    "words", ["campaign", "campaign algorithms", "bench frame", "endurance", "render --ra 1", "replay run"]
+)
+def test_a_command_that_compiles_kernels_says_so(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`campaign` and `bench` compiled for two minutes in silence."""
+    written = iter((1, 2, 2))
+    counted = threading.Event()
+
+    def written_since(_begin_s: float) -> int:
+        try:
+            return next(written)
+        except StopIteration:
+            counted.set()
+            return 2
+
+    def run(*_arguments: object) -> None:
+        assert counted.wait(PATIENCE_S)
+        raise SystemExit(0)
+
+    monkeypatch.setattr("starid.cli.output.PROGRESS_S", 0.001)
+    monkeypatch.setattr("starid.storage.cache.kernels_written_since", written_since)
+    monkeypatch.setattr(CompileProgress, "compiled", lambda _progress: 20)
+    monkeypatch.setattr("starid.cli.command_line.run", run)
+    _, _, said = run_command_line(*words.split())
+    total = len(kernels_of(output.kernel_modules()))
+    line = rf"compiling: \d+ s, 20 of at most {total} kernels compiled; later runs use them\n"
+    assert re.fullmatch(2 * line, said)

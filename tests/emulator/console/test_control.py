@@ -7,7 +7,7 @@ from starhil.emulator.run.faults import DeviceFault
 from starhil.protocol.unit import load_unit
 from tests.emulator.console.pages import ALONG_X, OPTIONS, Page
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("prompt_pages")]
 
 
 def test_faults_scenarios_and_truth_are_set_from_the_page_and_nothing_else(run):

@@ -19,7 +19,7 @@ from tests.emulator.conftest import ORION, PREVIEW
 from tests.emulator.console.pages import OPTIONS, Page
 from tests.emulator.runs import Control, command, every_row_read
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("prompt_pages")]
 
 ICD = load_unit()
 JSON_TYPES = {"object": dict, "string": str, "number": (int, float), "integer": int, "boolean": bool}

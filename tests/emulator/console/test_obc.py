@@ -15,7 +15,7 @@ from tests.candump import parse_candump
 from tests.emulator.console.pages import OPTIONS, Page
 from tests.waiting import PATIENCE_S
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("prompt_pages")]
 
 LINKS_OFF = {"serial": {"port": "off"}, "can": {"channel": "off"}}
 

@@ -9,7 +9,7 @@ import pytest
 from tests.emulator.console.pages import OPTIONS, Page
 from tests.emulator.runs import Control
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("prompt_pages")]
 
 VALUES = (
     None, True, 0, -1, 2**70, 1e308, "", "x", "\ud800", [], [None], [1, "x", {}],

@@ -1,10 +1,12 @@
 """What a page of the console receives, also one that does not read or comes late, and how often it is served."""
 
 import asyncio
+import gc
 import json
 import socket
 import struct
 import time
+import warnings
 from contextlib import AsyncExitStack, suppress
 from dataclasses import replace
 from urllib.parse import urlsplit
@@ -12,12 +14,12 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
-from starhil.emulator.console import server
 from starhil.emulator.console.console import Console
 from starhil.emulator.console.history import COLUMNS, MODES, History, Image
 from starhil.emulator.console.viewer import PAUSE_S, QUEUE_LIMIT, TURN_ITEMS, Viewer
 from starhil.emulator.links.traffic import WireItem
 from starhil.protocol.can.frame import CanFrame
+from starhil.protocol.transports.connections import Budget
 from tests.emulator.conftest import PREVIEW
 from tests.emulator.console.pages import ALONG_X, OPTIONS, Page, column
 from tests.emulator.runs import command, read
@@ -397,72 +399,105 @@ def test_a_page_that_acknowledges_late_gets_the_numbers_of_every_frame(run):
     run(scenario, options=OPTIONS)
 
 
-def test_the_requests_of_a_page_come_at_most_so_often(run, monkeypatch):
-    times = []
-    subscribe = Console._subscribe
-
-    async def noted(self, viewer, request):
-        times.append(asyncio.get_running_loop().time())
-        return await subscribe(self, viewer, request)
-
-    monkeypatch.setattr(Console, "_subscribe", noted)
-
-    async def scenario(emulation, _line):
-        async with Page(emulation, field="view_only") as page:
-            for number in range(30):
-                text = json.dumps({"id": number, "do": "subscribe", "wire": number % 2 == 0, "frames": True})
-                await page.socket.send_str(text)
-            await page.message("answer", lambda item: item["id"] == 29)
-
-    run(scenario, options=replace(OPTIONS, console=replace(OPTIONS.console, view_token="look")))
-    assert len(times) == 30
-    assert min(np.diff(times)) >= server.PAGE_TURN_S
-
-
-def test_the_requests_of_many_pages_are_executed_at_most_so_often(run, monkeypatch):
+@pytest.mark.parametrize("count", [1, 8])
+def test_the_requests_of_pages_that_only_view_take_a_part_of_the_loop(run, monkeypatch, count):
     """32 pages that asked for messages of the trace were answered in bursts, which held up replies on the bus by 40 ms."""
-    times = []
+    begun, each_s = [], 0.002
     message = Console._message
 
-    async def noted(self, viewer, request):
-        times.append(asyncio.get_running_loop().time())
+    async def busy(self, viewer, request):
+        begun.append(asyncio.get_running_loop().time())
+        begin_s = time.thread_time()
+        while time.thread_time() - begin_s < each_s:
+            pass
         return await message(self, viewer, request)
 
-    monkeypatch.setattr(Console, "_message", noted)
+    monkeypatch.setattr(Console, "_message", busy)
 
     async def scenario(emulation, _line):
         emulation.traffic.passed.emit(
             WireItem(0.0, "can", outgoing=False, item=CanFrame(0x04800104, extended=True))
         )
         async with AsyncExitStack() as stack:
-            pages = [await stack.enter_async_context(Page(emulation, field="view_only")) for _ in range(8)]
-            for number in range(8):
+            pages = [
+                await stack.enter_async_context(Page(emulation, field="view_only")) for _ in range(count)
+            ]
+            for number in range(16):
                 text = json.dumps({"id": number, "do": "message", "n": 0})
                 for page in pages:
                     await page.socket.send_str(text)
             for page in pages:
-                await page.message("answer", lambda item: item["id"] == 7)
+                await page.message("answer", lambda item: item["id"] == 15)
 
     run(scenario, options=replace(OPTIONS, console=replace(OPTIONS.console, view_token="look")))
-    assert len(times) == 64
-    assert min(np.diff(times)) >= server.TURN_S
+    assert len(begun) == 16 * count
+    assert len(begun) * each_s < 0.4 * (begun[-1] - begun[0] + each_s)
+
+
+def test_the_requests_of_a_page_that_commands_do_not_wait_for_those_of_others(run, monkeypatch):
+    count, answered, message = 200, [], Console._message
+
+    async def busy(self, viewer, request):
+        answered.append(viewer.commands)
+        begin_s = time.thread_time()
+        while not viewer.commands and time.thread_time() - begin_s < 0.01:
+            pass
+        return await message(self, viewer, request)
+
+    monkeypatch.setattr(Console, "_message", busy)
+
+    async def scenario(emulation, _line):
+        emulation.traffic.passed.emit(
+            WireItem(0.0, "can", outgoing=False, item=CanFrame(0x04800104, extended=True))
+        )
+        async with Page(emulation) as page, Page(emulation, field="view_only") as viewer:
+            for number in range(count):
+                await viewer.socket.send_str(json.dumps({"id": number, "do": "message", "n": 0}))
+            for _ in range(3):
+                await page.ask(do="message", n=0)
+
+    run(scenario, options=replace(OPTIONS, console=replace(OPTIONS.console, view_token="look")))
+    assert sum(answered) == 3
+    assert len(answered) < count / 2
+
+
+def test_a_page_that_closes_before_its_requests_are_executed_leaves_no_warning(run):
+    async def scenario(emulation, _line):
+        for _ in range(5):
+            async with Page(emulation, field="view_only") as page:
+                for number in range(16):
+                    await page.socket.send_str(json.dumps({"id": number, "do": "parameters"}))
+                await asyncio.sleep(0.002)
+        gc.collect()
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        run(scenario, options=replace(OPTIONS, console=replace(OPTIONS.console, view_token="look")))
+    assert not [str(each.message) for each in said if "never awaited" in str(each.message)]
 
 
 @pytest.mark.parametrize("kind", ["ping", "pong"])
-def test_pings_and_pongs_of_a_page_have_their_turns_like_requests(run, kind):
+def test_pings_and_pongs_of_a_page_have_their_turns_like_requests(run, monkeypatch, kind):
     """Two pages that only sent pings held up replies on the bus by more than a second."""
-    count = 30
+    count, turns = 30, []
+    end_turn = Budget._end_turn
+
+    def noted(self):
+        turns.append(self)
+        end_turn(self)
+
+    monkeypatch.setattr(Budget, "_end_turn", noted)
 
     async def scenario(emulation, _line):
         async with Page(emulation, field="view_only") as page:
-            begin_s = asyncio.get_running_loop().time()
+            before = len(turns)
             for _ in range(count):
                 await getattr(page.socket, kind)(b"")
             await page.ask(do="parameters")
-            return asyncio.get_running_loop().time() - begin_s
+            return len(turns) - before
 
     options = replace(OPTIONS, console=replace(OPTIONS.console, view_token="look"))
-    assert run(scenario, options=options) >= count * server.PAGE_TURN_S
+    assert run(scenario, options=options) > count
 
 
 CHUNKS = b"POST /runs HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n" + b"1\r\nx\r\n" * 200_000

@@ -99,6 +99,17 @@ def test_a_corrupt_file_gives_defaults_and_a_flag_and_is_set_aside(tmp_path, kin
     store.close()
 
 
+def test_every_corrupt_file_is_kept(tmp_path):
+    """The second one replaced the first."""
+    store = FileStore(tmp_path)
+    for text in ("first", "second", "third"):
+        store.path.write_text(text)
+        assert store.load() == {}
+    kept = [tmp_path / f"{STATE_FILE}.corrupt{number}" for number in ("", "-2", "-3")]
+    assert [path.read_text() for path in kept] == ["first", "second", "third"]
+    store.close()
+
+
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(junk=st.binary(max_size=300))
 def test_no_content_of_the_file_is_a_crash(tmp_path_factory, junk):

@@ -37,7 +37,7 @@ from starhil.protocol.unit import load_unit
 from tests.emulator.console.pages import OPTIONS, Page
 from tests.waiting import wait_until
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("prompt_pages")]
 
 LEVELS: Final = {
     "optical": OPTICAL_FAULT,

@@ -122,6 +122,70 @@ def test_what_comes_in_a_rest_is_passed_on_in_order_and_the_end_after_it() -> No
     assert protocol.got == data + b"end"
 
 
+def test_of_work_in_turns_one_step_is_done_in_a_turn_of_the_loop_and_together_it_takes_a_part() -> None:
+    each_s, steps, turn = 0.002, [], 0
+
+    async def work() -> None:
+        for _ in range(5):
+            steps.append((turn, asyncio.get_running_loop().time()))
+            begin_s = time.thread_time()
+            while time.thread_time() - begin_s < each_s:
+                pass
+            await asyncio.sleep(0)
+
+    async def count() -> None:
+        nonlocal turn
+        while True:
+            turn += 1
+            await asyncio.sleep(0)
+
+    async def main() -> None:
+        budget, counting = Budget(), asyncio.create_task(count())
+        await asyncio.gather(*(budget.run(work()) for _ in range(10)))
+        counting.cancel()
+
+    asyncio.run(main())
+    assert len({turn for turn, _ in steps}) == len(steps) == 50
+    assert len(steps) * each_s < 0.4 * (steps[-1][1] - steps[0][1] + each_s)
+
+
+def test_work_in_turns_ends_as_it_would_by_itself() -> None:
+    ends = []
+
+    async def work(what: object) -> object:
+        try:
+            if isinstance(what, Exception):
+                raise what
+            if what == "late":
+                async with asyncio.timeout(0.01):
+                    await asyncio.Event().wait()
+            if what == "never":
+                await asyncio.Event().wait()
+            return await asyncio.sleep(0.001, what)
+        finally:
+            ends.append(what)
+
+    async def main() -> None:
+        budget = Budget()
+        assert await budget.run(work(3)) == 3
+        with pytest.raises(KeyError):
+            await budget.run(work(KeyError()))
+        with pytest.raises(TimeoutError):
+            await budget.run(work("late"))
+        waiting = [asyncio.create_task(budget.run(work("never"))) for _ in range(3)]
+        await asyncio.sleep(0.01)
+        for task in waiting:
+            task.cancel()
+        assert all(
+            isinstance(end, asyncio.CancelledError)
+            for end in await asyncio.gather(*waiting, return_exceptions=True)
+        )
+        assert await budget.run(work(4)) == 4
+
+    asyncio.run(main())
+    assert [str(end) for end in ends] == ["3", "", "late", "never", "never", "never", "4"]
+
+
 def test_a_server_accepts_connections_with_pauses() -> None:
     """A peer that only opened and closed connections held up replies on the bus by 0.2 s."""
     accepted: list[float] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 import threading
@@ -150,22 +151,26 @@ def test_an_extra_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: py
     assert not list(tmp_path.iterdir())
 
 
-def test_compiling_is_reported_while_the_number_of_kernels_grows(monkeypatch, capsys):
-    numbers = iter((10, 10, 12, 12, 15))
+@pytest.mark.parametrize("start", [False, True])
+def test_compiling_is_reported_while_the_number_of_kernels_grows(monkeypatch, capsys, start):
+    written, compiled = iter((0, 2, 2, 5)), iter((12, 15))
     counted = threading.Event()
 
-    def compiled(_progress: CompileProgress) -> int:
+    def written_since(_begin_s: float) -> int:
         try:
-            return next(numbers)
+            return next(written)
         except StopIteration:
             counted.set()
-            return 15
+            threading.Event().wait()  # what is printed is complete
+            return 5
 
-    monkeypatch.setattr(CompileProgress, "compiled", compiled)
-    monkeypatch.setattr(output, "_COMPILING_EVERY_S", 0.001)
-    with output.compiling_reported("starid.photograph.solver"):
+    monkeypatch.setattr("starid.storage.cache.kernels_written_since", written_since)
+    monkeypatch.setattr(CompileProgress, "compiled", lambda _progress: next(compiled))
+    monkeypatch.setattr(output, "PROGRESS_S", 0.001)
+    with output.compiling_reported(["starid.photograph.solver"], start=start):
         assert counted.wait(PATIENCE_S)
     total = len(CompileProgress(["starid.photograph.solver"]).kernels)
-    assert capsys.readouterr().err.splitlines() == [
-        f"compiling: 0 s, {number} of {total} kernels; later runs use them" for number in (12, 15)
-    ]
+    done = [f", {number} of at most {total} kernels compiled; later runs use them" for number in (12, 15)]
+    expected = ["", done[0], done[0], done[1]] if start else done
+    lines = [rf"{'starting' if start else 'compiling'}: \d+ s{line}\n" for line in expected]
+    assert re.fullmatch("".join(lines), capsys.readouterr().err)

@@ -107,6 +107,20 @@ def test_the_annotated_image_is_written_in_colour(tmp_path):
     assert (image[..., 0] != image[..., 1]).any()
 
 
+@pytest.mark.parametrize(
+    "command", [("annotate",), ("identify", "--fov", "42"), ("calibrate", "--fov", "42")]
+)
+def test_the_image_itself_is_not_written_over(tmp_path, command):
+    """`starid annotate` replaced a photograph by its annotated copy."""
+    image = tmp_path / "photo.png"
+    cv2.imwrite(str(image), np.zeros((64, 64), np.uint8))
+    before = image.read_bytes()
+    done = starid(*command, str(image), "-o", str(image))
+    assert isinstance(done.exception, StaridError)
+    assert "is a file that is read; name another one with -o" in str(done.exception)
+    assert image.read_bytes() == before
+
+
 def test_noise_alone_gives_no_attitude(tmp_path):
     image = tmp_path / "noise.png"
     cv2.imwrite(str(image), np.random.default_rng(1).normal(60, 4, (937, 937)).astype(np.uint8))
@@ -269,6 +283,23 @@ def test_a_bright_light_that_is_not_identified_is_explained(tmp_path):
     assert (light["x_px"], light["y_px"]) == pytest.approx((600.0, 300.0), abs=0.2)
     assert "a planet" in light["why"]
     assert "bright at (600, 300) px, not identified" in starid("identify", str(image)).output
+
+
+def test_stars_of_the_catalogue_in_one_spot_are_not_called_a_planet(tmp_path):
+    image = tmp_path / "sky.png"
+    orion = [
+        "--ra",
+        "84",
+        "--dec",
+        "-1",
+        "--fov",
+        "20",
+        "--size",
+        "640x480",
+    ]  # with theta Orionis: four stars in two pixels
+    assert starhil("render", *orion, "-o", str(image)).exit_code == 0
+    (light,) = answer(image, "--fov", "20")["unidentified"]
+    assert light["why"] == "4 stars of the catalogue in one spot, so its place is that of none"
 
 
 def test_a_solution_prints_as_five_lines(tmp_path):

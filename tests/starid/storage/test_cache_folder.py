@@ -16,8 +16,8 @@ from types import SimpleNamespace
 import pytest
 
 from starid.storage import cache
+from tests.users import HAS_OTHERS, OTHER_USER, THIS_USER, needs_others
 
-OTHER_USER, THIS_USER = 12345, 54321
 USES_IT = """
 import os, sys
 from starid.storage.cache import cache_dir, cached_tables
@@ -72,8 +72,10 @@ def own_folder(temporary: Path) -> Path:
 
 def give_away(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Have a folder belong to another user, or be another user than its owner."""
-    if os.geteuid() == 0:
+    if HAS_OTHERS:
         os.chown(folder, OTHER_USER, OTHER_USER)
+    elif os.geteuid() == 0:
+        pytest.skip("root is the only user here")
     else:
         monkeypatch.setattr(os, "geteuid", lambda: THIS_USER)
 
@@ -103,12 +105,11 @@ def test_a_folder_that_another_user_has_put_there_is_not_used(
     assert "set STARHIL_CACHE_DIR" in warning.message
 
 
+@needs_others
 @pytest.mark.usefixtures("homeless")
 def test_a_link_that_another_user_has_put_there_is_not_followed(
     temporary: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if os.geteuid() != 0:
-        pytest.skip("only root can give a link to another user")
     (tmp_path / "documents").mkdir(0o700)
     link = own_folder(temporary)
     link.symlink_to(tmp_path / "documents")
@@ -162,6 +163,8 @@ def test_a_private_group_of_the_user_may_write(
     monkeypatch.setattr(grp, "getgrgid", lambda _group: group)
     if os.geteuid() == 0:
         assert cache.cache_dir() == own_folder(temporary)  # group 0: every user of a container may be in it
+        if not HAS_OTHERS:
+            return
         os.chown(named, -1, OTHER_USER)
     assert cache.cache_dir() == named
     group.gr_mem.append("mallory")
@@ -206,7 +209,7 @@ def test_kernels_to_which_others_may_write_are_not_used_whatever_the_folder_abov
     assert cache.kernel_folder(key) == folder
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can be two users")
+@needs_others
 def test_a_container_with_a_random_user_does_not_use_what_another_has_left() -> None:
     with tempfile.TemporaryDirectory() as shared:
         Path(shared).chmod(0o1777)

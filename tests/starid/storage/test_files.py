@@ -8,12 +8,15 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.simulation.output_file import OutputFile
 from starhil.hil_tests.client.wire_log import WireLog
 from starid.attitude import Attitude, turn_text
 from starid.camera.file import load_camera
@@ -24,6 +27,7 @@ from starid.identification.thesis.database import DatabaseError
 from starid.identification.thesis.database_file import load_database
 from starid.imaging.image_io import read_image, write_image
 from starid.storage.files import read_bytes, read_number, read_text, write_atomically
+from tests.users import OTHER_USER, needs_others
 from tests.waiting import PATIENCE_S
 
 READERS = [
@@ -70,7 +74,7 @@ def test_a_link_to_a_file_stays_a_link_and_the_file_is_replaced(tmp_path: Path) 
     assert list(target.parent.iterdir()) == [target]
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a link to another user")
+@needs_others
 @pytest.mark.parametrize("hidden", [False, True], ids=["", "behind an own link"])
 def test_a_link_of_another_user_is_not_followed(tmp_path: Path, *, hidden: bool) -> None:
     """In /tmp, it could lead to any file of this user, which was replaced."""
@@ -78,7 +82,7 @@ def test_a_link_of_another_user_is_not_followed(tmp_path: Path, *, hidden: bool)
     target.write_bytes(b"precious")
     link.symlink_to(target)
     own.symlink_to(link.name)
-    os.lchown(link, 12345, 12345)
+    os.lchown(link, OTHER_USER, OTHER_USER)
     path = own if hidden else link
     with pytest.raises(PermissionError, match="a link that user 12345 has made"):
         write_atomically(path, lambda part: part.write_bytes(b"whole"))
@@ -87,6 +91,50 @@ def test_a_link_of_another_user_is_not_followed(tmp_path: Path, *, hidden: bool)
     with pytest.raises(PermissionError, match="a link that user 12345 has made"):
         WireLog(path)
     assert target.read_bytes() == b"precious"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a link to another user")
+@pytest.mark.parametrize("write", [WireLog, lambda path: OutputFile("log", path, overwrite=True)])
+def test_a_link_that_another_user_makes_just_before_the_file_is_opened_is_not_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, write: Callable[[Path], object]
+) -> None:
+    path, target, lstat = tmp_path / "log", tmp_path / "precious", os.lstat
+    target.write_bytes(b"precious")
+
+    def lstat_before_the_link(file: Path) -> os.stat_result:
+        try:
+            return lstat(file)
+        finally:
+            if file == path:
+                monkeypatch.undo()
+                path.symlink_to(target)
+                os.lchown(path, 12345, 12345)
+
+    monkeypatch.setattr(os, "lstat", lstat_before_the_link)
+    with pytest.raises((OSError, EmulatorError), match="symbolic links"):
+        write(path)
+    assert path.is_symlink()
+    assert target.read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize("umask", [0o002, 0o022, 0o027, 0o077])
+def test_a_new_file_has_the_mode_that_the_umask_leaves_and_a_replaced_one_keeps_its_own(
+    tmp_path: Path, umask: int
+) -> None:
+    """All were readable by everybody, whatever the umask."""
+    atomic, log, output, private = (tmp_path / name for name in ("atomic", "log", "output", "private"))
+    private.touch(0o600)
+    before = os.umask(umask)
+    try:
+        for path in (atomic, private):
+            write_atomically(path, lambda part: part.write_bytes(b"whole"))
+        WireLog(log).close()
+        OutputFile("log", output).close()
+    finally:
+        os.umask(before)
+    modes = [stat.S_IMODE(path.stat().st_mode) for path in (atomic, log, output)]
+    assert modes == [0o666 & ~umask] * 3
+    assert stat.S_IMODE(private.stat().st_mode) == 0o600
 
 
 def test_a_folder_is_not_overwritten(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from starid.storage import temporary_folder
 from starid.storage.temporary_folder import make_temporary_folder
+from tests.users import HAS_OTHERS, OTHER_USER
 from tests.waiting import PATIENCE_S
 
 PREFIX = "starhil-test-"
@@ -69,11 +70,11 @@ def test_what_is_new_or_no_folder_of_the_user_stays(base: Path) -> None:
     (target / "kept").write_text("")
     link.symlink_to(target.rename(base / "target"))
     (base / "target" / "more").mkdir()
-    if os.geteuid() == 0:
+    if HAS_OTHERS:
         other.mkdir()
-        os.chown(other, 12345, 12345)
+        os.chown(other, OTHER_USER, OTHER_USER)
         age(other)
     make_temporary_folder(PREFIX)
     assert new.is_dir()
     assert (base / "target" / "kept").exists()
-    assert os.geteuid() != 0 or other.is_dir()
+    assert not HAS_OTHERS or other.is_dir()

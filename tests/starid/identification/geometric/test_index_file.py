@@ -23,6 +23,8 @@ pytestmark = pytest.mark.long
 
 CAMERA = Camera.from_fov(60.0, 512, 512)
 MAX_BYTES = 10_000_000
+DEEP = 200_000
+"""Brackets that no version of Python decodes: 3.13 decodes 9 000."""
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +67,7 @@ def test_arrays_are_loaded_unchanged_and_read_only(stored: Path) -> None:
         (lambda b: b[: len(b) - 1000] + bytes([b[-1000] ^ 1]) + b[len(b) - 999 :], "checksum"),
         (lambda b: b.replace(b'"key"', b'"kei"', 1), "key"),
         (lambda b: b[:8] + (1 << 62).to_bytes(8, "little") + b[16:], "header is truncated"),
-        (lambda b: b[:8] + (9000).to_bytes(8, "little") + b"[" * 9000, "recursion"),
+        (lambda b: b[:8] + DEEP.to_bytes(8, "little") + b"[" * DEEP, "while decoding"),
     ],
     ids=["empty", "foreign", "header", "half", "one byte", "one bit", "no key", "absurd length", "deep"],
 )
