@@ -16,6 +16,7 @@ pytest loads this module in every run, so the bench is imported only when a fixt
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -32,8 +33,19 @@ if TYPE_CHECKING:
 
 FILE_OPTIONS: Final[dict[Kind, str]] = {"unit": "--starhil-unit", "profile": "--starhil-profile"}
 """Options that name what ships with the package, or a file."""
+SHORTEST_S: Final = 0.01
+LONGEST_S: Final = 1e6
+"""Limits of `--starhil-timeout`, seconds."""
 _EMULATOR_LINKS: Final = (None, "auto", "off")
 """Values of the options of links that name no unit."""
+
+
+def _seconds(text: str) -> float:
+    """Return a time-out; pytest makes one line of the ValueError."""
+    seconds = float(text)
+    if not SHORTEST_S <= seconds <= LONGEST_S:
+        raise argparse.ArgumentTypeError(f"must be {SHORTEST_S:g} to {LONGEST_S:g} s, not {text}")
+    return seconds
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -65,7 +77,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--starhil-seed", default=1, type=int, metavar="N", help="seed of the emulator (default 1)"
     )
     group.addoption(
-        "--starhil-timeout", default=10.0, type=float, metavar="S", help="time-out of a reply (default 10 s)"
+        "--starhil-timeout",
+        default=10.0,
+        type=_seconds,
+        metavar="S",
+        help="time-out of a reply (default 10 s)",
     )
 
 
@@ -171,10 +187,14 @@ def starhil_emulator(request: pytest.FixtureRequest) -> EmulatorProcess:
         pytest.skip(f"{unit} names a unit, and this test needs an emulator")
     marker = request.node.get_closest_marker("starhil")
     wanted = {} if marker is None else dict(marker.kwargs)
-    profile = wanted.pop("profile", None) or request.config.getoption("--starhil-profile")
-    settings = tuple(wanted.pop("settings", ()))
-    if wanted or (marker is not None and marker.args):
-        pytest.fail("the marker starhil takes profile=… and settings=[…]", pytrace=False)
+    profile, settings = wanted.pop("profile", None), wanted.pop("settings", ())
+    texts = [*settings, profile or ""] if isinstance(settings, (list, tuple)) else [None]
+    right = all(isinstance(text, str) and "\0" not in text for text in texts)
+    if not right or wanted or (marker is not None and marker.args):
+        pytest.fail(
+            'the marker starhil takes profile="NAME" and settings=["section.key=value", …]', pytrace=False
+        )
+    profile, settings = profile or request.config.getoption("--starhil-profile"), tuple(settings)
     emulators: _Emulators = request.getfixturevalue("_starhil_emulators")
     with _failing_in_one_line():
         return emulators.get(profile, settings)

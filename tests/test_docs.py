@@ -13,6 +13,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -228,6 +229,33 @@ def columns_of_files_and_caches(title: str) -> list[str]:
     (section,) = re.findall(rf"^## {title}\n(.*?)^## ", text, re.MULTILINE | re.DOTALL)
     cells = re.findall(r"^\|([^|]*)", section, re.MULTILINE)
     return [name for cell in cells for name in re.findall(r"`(\w+)`", cell)]
+
+
+def case_counts(*words: str) -> dict[str, int]:
+    """Return how many cases there are on each link; those that only list values without a rule do not count."""
+    _, listed, _ = run_command_line("conformance", "--list", *words)
+    areas = [line.split(".")[:2] for line in listed.splitlines()]
+    return Counter(link for link, area in areas if area != "unjudged")
+
+
+def test_the_numbers_of_conformance_cases_are_those_that_the_command_lists():
+    own = case_counts("--canopen", "44")
+    (row,) = [
+        line
+        for line in (DOCS.parent / "README.md").read_text("utf-8").splitlines()
+        if "conformance cases |" in line
+    ]
+    assert row.split(" | ")[1] == f"{own['serial']} serial, {own['can']} CAN, {own['canopen']} CANopen"
+    both = f"{own['can']} + {own['canopen']}"
+    gen2 = case_counts("--unit", "cubestar-gen2")
+    others = {unit: case_counts("--unit", unit)["serial"] for unit in ("sagitta", "nos3", "st16", "st200")}
+    serial = ", ".join(
+        f"{unit} {count}" for unit, count in [*others.items(), ("cubestar-gen2", gen2["serial"])][1:]
+    )
+    oresat = case_counts("--unit", "oresat", "--canopen", "44")["canopen"]
+    assert [cells[2] for cells in table_after("bus.md", "Conformance on real buses")] == [
+        f"{own['serial']} each", both, f"{others['sagitta']} ({serial})", str(gen2["can"]), str(oresat), both
+    ]  # fmt: skip
 
 
 def test_files_and_caches_has_every_column_of_a_truth_file():

@@ -34,17 +34,34 @@ def test_the_package_is_run_as_its_command(program):
     assert done.stdout == f"{program} {project_version()}\n"
 
 
-def test_the_citation_names_the_version():
-    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert re.findall(r"^version: (.*)$", text, re.MULTILINE) == [project_version()]
-
-
-def test_the_changelog_starts_with_unreleased_and_then_the_version():
+def releases() -> tuple[str, list[tuple[str, str]]]:
+    """Return the text of [Unreleased] in the changelog, and version and date of the releases, newest first."""
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    titles = re.findall(r"^## \[(.*?)\]( - \d{4}-\d\d-\d\d)?$", text, re.MULTILINE)
-    assert titles[0] == ("Unreleased", "")
-    assert titles[1][0] == project_version()
-    assert titles[1][1]
+    _, unreleased, *others = re.split(r"^## ", text, flags=re.MULTILINE)
+    title, _, body = unreleased.partition("\n")
+    assert title == "[Unreleased]"
+    return body.strip(), [
+        re.findall(r"^\[(.*?)\] - (\d{4}-\d\d-\d\d)$", part, re.MULTILINE)[0] for part in others
+    ]
+
+
+def test_a_version_is_a_release_or_in_development_after_it():
+    unreleased, ((newest, _), *_) = releases()
+    version, _, development = project_version().partition(".dev")
+    if development:
+        assert [int(part) for part in version.split(".")] > [int(part) for part in newest.split(".")]
+    else:
+        assert version == newest
+        assert not unreleased
+
+
+def test_the_citation_names_the_newest_release_and_its_date():
+    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
+    named = [
+        re.findall(rf"^{key}: \W?([\d.-]+)\W?$", text, re.MULTILINE) for key in ("version", "date-released")
+    ]
+    _, (newest, *_) = releases()
+    assert named == [[part] for part in newest]
 
 
 def test_the_long_description_has_no_relative_link_or_image():

@@ -260,7 +260,11 @@ def test_the_sessions_of_the_readme_pass_and_test_an_emulator_that_runs(shell):
     shell.instead |= {"127.0.0.1:8080": "127.0.0.1:0", "--can vcan0": "--can auto"}
     shell.type(watch)
     bus, view = shell.ready["can"], shell.ready["view"]
-    shell.instead = {"--can vcan0": f"--can {bus}", "http://127.0.0.1:8080/?token=…": view}
+    shell.instead = {
+        "/tmp/startracker": shell.ready["serial"],
+        "--can vcan0": f"--can {bus}",
+        "http://127.0.0.1:8080/?token=…": view,
+    }
     assert " passed" in shell.type(third)
     session, _ = lines_of("docs/console.md", "starhil session my_session.toml")
     assert " passed" in shell.type(session)

@@ -366,10 +366,7 @@ class ConsoleServer:
                 answer = {"type": "answer", "id": request.get("id"), "ok": False, "error": error}
                 viewer.send(json.dumps(answer))
                 continue
-            answer_request = self._answer(console, viewer, request)
-            task = asyncio.create_task(
-                answer_request if viewer.commands else self._budget.run(answer_request)
-            )
+            task = asyncio.create_task(self._answer(console, viewer, request))
             tasks.add(task)
             task.add_done_callback(tasks.discard)
 
@@ -378,7 +375,11 @@ class ConsoleServer:
         async with viewer.turn:
             while viewer.behind:
                 await asyncio.sleep(BEHIND_S)
-        viewer.send(json.dumps(await console.answer(viewer, request)))
+
+        async def execute() -> None:
+            viewer.send(json.dumps(await console.answer(viewer, request)))
+
+        await (execute() if viewer.commands else self._budget.run(execute()))
 
 
 class _ServerLog(logging.LoggerAdapter[logging.Logger]):

@@ -52,6 +52,7 @@ from starhil.protocol.transports.connections import (
     ConnectionLimit,
     Listener,
     detect_lost_peer,
+    limit_buffers,
     listen,
     stream_protocol,
 )
@@ -155,6 +156,7 @@ class ControlServer:
         if not self._limit.admits(writer.transport, len(self._peers)):
             return
         self._peers[writer] = False
+        limit_buffers(writer.transport)
         if self._socket is None:
             detect_lost_peer(writer.transport, must_read=True)
         lines = read_lines(reader, MAX_LINE, within_s=REQUEST_S)

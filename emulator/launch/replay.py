@@ -324,6 +324,8 @@ class _Playing:
                 recording.append(WireItem(entry.ns / NANOSECONDS, entry.link, outgoing, entry.item))
                 if outgoing:
                     continue
+            if self.ended:
+                raise EmulatorError(f"replay {where}: comes after the entry `end`; the recording is damaged")
             stepped.set_ns(entry.ns)
             try:
                 await self._play(entry)

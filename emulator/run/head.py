@@ -141,6 +141,11 @@ class Head:
                 self.traffic.add(link)
                 await link.start()
                 self.ready_fields |= {**link.ready_fields, **self.ready_fields}
+        for name, value in self.ready_fields.items():
+            if any(character.isspace() for character in value):
+                raise EmulatorError(
+                    f"{name} {value!r}: must be a name without blanks, which end a field of the ready line"
+                )
 
     def serial_dialect(self) -> Dialect | None:
         """Return the current dialect of the serial line; None without a line or dialects."""

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import logging
 import socket
+import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
@@ -21,6 +22,7 @@ from starhil.protocol.transports.connections import (
     Budget,
     ConnectionLimit,
     Listener,
+    limit_buffers,
     listen,
     stream_protocol,
 )
@@ -87,8 +89,8 @@ MAX_LINES: Final = 32
 MAX_WAITING: Final = 200
 """Most lines of datagrams that wait while others are processed."""
 
-MAX_DATAGRAMS: Final = 64
-"""Most datagrams that are received in a turn, some 0.2 ms of work."""
+TURN_S: Final = 0.0001
+"""Processor time after which a turn receives no further datagrams, and again after which it processes no further lines, seconds."""
 
 LONGEST_DATAGRAM: Final = 65536
 
@@ -135,16 +137,18 @@ class _Datagrams:
             self._socket = None
 
     def _turn(self, source: socket.socket) -> None:
-        """Receive what has come, and process lines until none waits or a rest is due."""
-        loop = asyncio.get_running_loop()
+        """Receive what has come, and process lines until none waits, a rest is due, or it takes long."""
+        loop, begin_s = asyncio.get_running_loop(), time.thread_time()
         with self._account.taking(), contextlib.suppress(OSError):  # nothing more is there
-            for _ in range(MAX_DATAGRAMS):
+            while time.thread_time() < begin_s + TURN_S:
                 self.add(source.recv(LONGEST_DATAGRAM))
         until_s = None
         while self.waiting and until_s is None:
             with self._account.taking():
                 self.process_line()
             until_s = self._account.rests_until_s()
+            if until_s is None and time.thread_time() >= begin_s + 2.0 * TURN_S:
+                until_s = loop.time()
         if until_s is not None:
             loop.remove_reader(source)
             self._rest = loop.call_at(until_s, self._end_rest, source)
@@ -261,6 +265,7 @@ class LiveFeed:
         if not self._limit.admits(writer.transport, len(self._writers)):
             return
         self._writers.add(writer)
+        limit_buffers(writer.transport)
         try:
             await self._budget.run(self._answer_messages(reader, writer))
         except ConnectionError:

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from starhil.protocol.errors import shortened
 
-TURN: Final = 4096
+TURN: Final = 2048
 """Maximum number of bytes read before other tasks run."""
 
 

@@ -35,6 +35,8 @@ POLL_S: Final = 0.04
 
 BMP_HEADER_SIZE: Final = 54
 """Size of the two headers of a BMP file."""
+LARGEST_FILE: Final = 64 * 1024 * 1024
+"""Size of a stored file above which it is not downloaded, bytes."""
 FILES_MAX: Final = 1000
 """Number of files after which a list without end is given up."""
 BURST_ROUNDS: Final = 20
@@ -148,9 +150,14 @@ async def download_by_bursts(client: AsyncObcClient, size: str, *, within_s: flo
     if not files:
         raise BadReplyError("file_info: the list of files is empty after save_image")
     file = files[-1]
-    data, repeats = b"", 0
-    while len(data) < int(file["size"]):
-        block, rounds = await _download_block(client, int(file["counter"]), len(data), within_s)
+    data, repeats, total = b"", 0, int(file["size"])
+    if total > LARGEST_FILE:
+        raise BadReplyError(
+            f"file_info.size: {total} bytes are no image; at most {LARGEST_FILE} are downloaded"
+        )
+    while len(data) < total:
+        left = min(MAX_BLOCK, total - len(data))
+        block, rounds = await _download_block(client, int(file["counter"]), len(data), left, within_s)
         data += block
         repeats += rounds
     if file_checksum(data) != file["crc"]:
@@ -177,9 +184,12 @@ async def list_files(client: AsyncObcClient, *, within_s: float) -> list[Mapping
 
 
 async def _download_block(
-    client: AsyncObcClient, counter: int, offset: int, within_s: float
+    client: AsyncObcClient, counter: int, offset: int, left: int, within_s: float
 ) -> tuple[bytes, int]:
-    """Load one block of the file and receive its packets; return it and the number of repeated requests."""
+    """Load one block of the file and receive its packets; return it and the number of repeated requests.
+
+    `left` is its length, as large as a block can be, or to the end of the file.
+    """
     block: dict[str, Value] = {
         "file_type": "bmp",
         "file_counter": counter,
@@ -195,6 +205,8 @@ async def _download_block(
 
     state = await client.wait_for("file_block", is_loaded, within_s=within_s, every_s=POLL_S)
     length = int(state["length"])
+    if length != left:
+        raise BadReplyError(f"file_block.length: must be {left} at {offset} of file {counter}, is {length}")
     count = packet_count(length)
     packets: dict[int, bytes] = {}
     for repeats in range(BURST_ROUNDS):

@@ -25,11 +25,31 @@ __tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 
 ANSWER_WITHIN_S: Final = 60.0
 """A step of the stepped clock takes as long as its frames."""
+LONGEST_ANSWER: Final = 1 << 24
+"""Longest answer that is read, bytes."""
 BOOT_WITHIN_S: Final = 60.0
 POLL_S: Final = 0.02
 CLOCK_GRAIN_S: Final = 1e-9
 LONGEST_WAIT_S: Final = 20.0
 """Longest wait of one request, shorter than an answer may take."""
+
+
+class _Answer(dict[str, Any]):
+    """An answer of a control channel; a key that it lacks is a `BenchError`."""
+
+    def __init__(self, what: str, address: str, content: dict[str, Any]) -> None:
+        super().__init__(content)
+        self._what = what
+        self._address = address
+
+    def __missing__(self, key: str) -> Any:
+        raise _other_peer(self._what, self._address)
+
+
+def _other_peer(what: str, address: str) -> BenchError:
+    return BenchError(
+        f"{what}: {address} does not answer as an emulator; give the address `control=` of its ready line"
+    )
 
 
 class ControlClient:
@@ -43,7 +63,8 @@ class ControlClient:
             self._socket = _connected(address)
         except (OSError, ValueError) as error:
             raise BenchError(f"control channel {address}: {reason(error)}") from None
-        self._lines = self._socket.makefile("rw", encoding="utf-8")
+        self._address = address
+        self._received = bytearray()
 
     def do(self, action: str, /, **keys: Any) -> dict[str, Any]:
         """Send a request and return the answer.
@@ -58,17 +79,38 @@ class ControlClient:
         Raises BenchError: the answer is an error, or there is none.
         """
         try:
-            self._lines.write(json.dumps(message) + "\n")
-            self._lines.flush()
-            line = self._lines.readline()
+            self._socket.settimeout(ANSWER_WITHIN_S)
+            self._socket.sendall(json.dumps(message).encode() + b"\n")
+            line = self._read_line(time.monotonic() + ANSWER_WITHIN_S)
         except OSError as error:
             raise BenchError(f"{what}: no answer: {reason(error)}") from None
-        if not line:
+        if line is None:
             raise BenchError(f"{what}: closed by the emulator")
-        answer: dict[str, Any] = json.loads(line)
-        if not answer.pop("ok"):
+        try:
+            answer = _Answer(what, self._address, json.loads(line))
+            accepted = answer.pop("ok")
+        except (ValueError, TypeError, KeyError, RecursionError):
+            raise _other_peer(what, self._address) from None
+        if accepted is not True:
             raise BenchError(f"{what}: {answer['error']}")
         return answer
+
+    def _read_line(self, deadline: float) -> bytes | None:
+        """Return the next line, or the beginning of what is none of a control channel; None if the peer has closed."""
+        received = self._received
+        while (end := received.find(b"\n")) < 0:
+            if not received.startswith(b"{"[: len(received)]) or len(received) > LONGEST_ANSWER:
+                return bytes(received)
+            self._socket.settimeout(max(deadline - time.monotonic(), POLL_S))
+            chunk = self._socket.recv(1 << 16)
+            if not chunk:
+                return None
+            received += chunk
+            if time.monotonic() > deadline:
+                raise TimeoutError("timed out")
+        line = bytes(received[: end + 1])
+        del received[: end + 1]
+        return line
 
     def wait(self, seconds: float = 0.0, *, phase: str | None = None) -> float:
         """Let simulation time pass on any clock; return the simulation time, seconds.
@@ -123,7 +165,6 @@ class ControlClient:
             time.sleep(POLL_S)
 
     def close(self) -> None:
-        self._lines.close()
         self._socket.close()
 
     def __enter__(self) -> Self:

@@ -393,7 +393,7 @@ async def listen(
 
 
 def limit_buffers(transport: asyncio.BaseTransport) -> None:
-    """Limit the kernel buffers of a TCP connection, which hold megabytes by default."""
+    """Limit the kernel buffers of a connection, which hold megabytes by default, also of a peer that has flooded it and gone."""
     for option in (socket.SO_SNDBUF, socket.SO_RCVBUF):
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, option, WINDOW)
 

@@ -359,10 +359,15 @@ def _centre(result: ImageSolution) -> dict[str, float]:
 
 
 def _unidentified(result: ImageSolution) -> list[dict[str, Any]]:
-    """Return which of the brightest detections are not identified, and why as far as the image shows it."""
+    """Return which of the brightest detections are not identified, and why as far as image and catalogue show it."""
     import numpy as np
 
+    from starid.catalog import load_catalog
+
     detections, camera = result.detections, result.camera
+    catalog = load_catalog()
+    catalog = catalog.brighter_than(float(catalog.v[result.solution.catalog_index].max()))
+    close_px = 6.0 * detections.psf_sigma_px
     brightest = np.argsort(-detections.flux, kind="stable")[:_BRIGHTEST]
     identified = set(result.solution.detection_index.tolist())
     xy = result.on_image(detections.xy_px)
@@ -377,10 +382,17 @@ def _unidentified(result: ImageSolution) -> list[dict[str, Any]]:
             why = "saturated, so its place is uncertain"
         elif detections.edge[index]:
             why = "cut off by the edge of the image"
-        elif apart.min() < 6.0 * detections.psf_sigma_px:
+        elif apart.min() < close_px:
             why = "close to another, so the two have one light"
-        elif not camera.project(camera.back_project(detections.xy_px[index][None]))[1][0]:
+        elif not camera.project(direction := camera.back_project(detections.xy_px[index][None]))[1][0]:
             why = "outside the calibrated field of the lens"
+        else:
+            place = result.solution.attitude.to_icrs(direction[0])
+            near = catalog.in_cone(place, close_px / max(camera.focal_px))
+            if len(near) > 1:
+                why = f"{len(near)} stars of the catalogue in one spot, so its place is that of none"
+            elif len(near):
+                why = f"beside HIP {catalog.hip[near[0]]}, but not in its place"
         rows.append({"x_px": float(xy[index, 0]), "y_px": float(xy[index, 1]), "why": why})
     return rows
 

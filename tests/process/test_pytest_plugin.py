@@ -126,6 +126,8 @@ def test_the_traceback_of_an_error_ends_at_the_test_and_a_fixture_has_none(tmp_p
         ("--starhil-unit=cubstar", "ERROR: --starhil-unit: unit 'cubstar': not found; "),
         ("--starhil-profile=idel", "ERROR: --starhil-profile: profile 'idel': not found; "),
         ("--starhil-dialect=z", "argument --starhil-dialect: invalid choice: 'z'"),
+        ("--starhil-timeout=-1", "argument --starhil-timeout: must be 0.01 to 1e+06 s, not -1"),
+        ("--starhil-timeout=nan", "argument --starhil-timeout: must be 0.01 to 1e+06 s, not nan"),
     ],
 )
 def test_a_wrong_option_ends_the_run_before_any_test(tmp_path, option, said):
@@ -133,3 +135,26 @@ def test_a_wrong_option_ends_the_run_before_any_test(tmp_path, option, said):
     assert said in out
     assert "Traceback" not in out
     assert "test_refused" not in out
+
+
+MISTYPED = [
+    'settings="camera.fov_deg=10"',
+    "settings=[5]",
+    "settings=None",
+    "profile=5",
+    'profile="\\0"',
+    "sets=[]",
+]
+
+
+def test_a_marker_with_a_wrong_value_fails_in_one_line(tmp_path):
+    """A text in place of a list was taken for settings of a letter each; others ended in a traceback."""
+    tests = "".join(
+        f"@pytest.mark.starhil({mark})\ndef test_{number}(starhil_serial): pass\n"
+        for number, mark in enumerate(MISTYPED)
+    )
+    out = run_pytest(tmp_path, f"import pytest\n{tests}")
+    assert f"{len(MISTYPED)} errors" in out
+    said = 'the marker starhil takes profile="NAME" and settings=["section.key=value", …]'
+    assert out.splitlines().count(said) == len(MISTYPED)
+    assert "Traceback" not in out

@@ -1,10 +1,12 @@
 """What a page of the console receives, also one that does not read or comes late, and how often it is served."""
 
 import asyncio
+import gc
 import json
 import socket
 import struct
 import time
+import warnings
 from contextlib import AsyncExitStack, suppress
 from dataclasses import replace
 from urllib.parse import urlsplit
@@ -457,6 +459,21 @@ def test_the_requests_of_a_page_that_commands_do_not_wait_for_those_of_others(ru
     run(scenario, options=replace(OPTIONS, console=replace(OPTIONS.console, view_token="look")))
     assert sum(answered) == 3
     assert len(answered) < count / 2
+
+
+def test_a_page_that_closes_before_its_requests_are_executed_leaves_no_warning(run):
+    async def scenario(emulation, _line):
+        for _ in range(5):
+            async with Page(emulation, field="view_only") as page:
+                for number in range(16):
+                    await page.socket.send_str(json.dumps({"id": number, "do": "parameters"}))
+                await asyncio.sleep(0.002)
+        gc.collect()
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        run(scenario, options=replace(OPTIONS, console=replace(OPTIONS.console, view_token="look")))
+    assert not [str(each.message) for each in said if "never awaited" in str(each.message)]
 
 
 @pytest.mark.parametrize("kind", ["ping", "pong"])

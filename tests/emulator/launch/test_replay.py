@@ -513,6 +513,21 @@ def test_a_truncated_recording_is_played_to_its_end_and_called_truncated(record,
     assert difference.startswith(f"{events}: truncated at ")
 
 
+def test_a_recording_that_goes_on_after_its_end_is_damaged(record):
+    """It was called identical, and only the entries before its end were counted."""
+
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    folder = record(scenario)
+    lines = (folder / EVENTS_FILE).read_text().splitlines(keepends=True)
+    after = next(number for number, line in enumerate(lines) if number > 3 and '"do": "in"' in line)
+    end = json.dumps({"ns": json.loads(lines[after - 1])["ns"], "do": "end"})
+    (folder / EVENTS_FILE).write_text("".join([*lines[:after], end, "\n", *lines[after:]]))
+    with pytest.raises(EmulatorError, match=rf"line {after + 2}: comes after the entry `end`"):
+        report_of(folder)
+
+
 def test_a_missing_truth_log_is_a_difference(record):
     async def scenario(emulation, _line):
         await talk(emulation, 3)

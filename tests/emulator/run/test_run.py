@@ -2,6 +2,7 @@
 
 import asyncio
 import csv
+import os
 import re
 import resource
 import time
@@ -560,3 +561,12 @@ def test_a_run_that_was_asked_for_many_saves_ends_soon_with_the_last(run, tmp_pa
     run(scenario, clock="real", device={"boot_s": 0.1}, run={"clock": "real", "state_dir": str(tmp_path)})
     assert len(contents) <= 3  # 5 s for each request alone
     assert FileStore(tmp_path).load()["parameters"]["exposure"] == 199
+
+
+@pytest.mark.parametrize("name", ["a b", "a\nb"])
+def test_a_port_whose_name_would_split_the_ready_line_is_rejected(run, tmp_path, name):
+    symlink = tmp_path / name
+    with pytest.raises(EmulatorError, match="without blanks") as refusal:
+        run(lambda *_: None, links={"serial": {"port": "auto", "symlink": str(symlink)}})
+    assert "\n" not in str(refusal.value)
+    assert not os.path.lexists(symlink)

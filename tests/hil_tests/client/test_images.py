@@ -144,6 +144,7 @@ def test_a_lost_can_frame_costs_its_packet_not_the_download(place):
         ("file_block", {"ready": False}, "file_block: the condition did not hold within 0 s"),
         ("file_block", {"ready": False, "parameter_error": True}, "the device has no bytes at 0 of file 1"),
         ("file_block", {"checksum": -1}, "packets missing or wrong after 20 bursts"),
+        ("file_block", {"length": 0, "checksum": 0}, "length: must be [0-9]+ at 0 of file 1, is 0"),
     ],
 )
 def test_what_the_device_does_wrong_is_named(row, values, words):
@@ -161,6 +162,20 @@ def test_a_file_with_another_checksum_than_in_the_list_is_rejected():
 
     device.telemetry = telemetry
     with pytest.raises(BenchError, match=r"the downloaded file has checksum \d+, the list 1"):
+        asyncio.run(download_by_bursts(device, "size_64", within_s=PATIENCE_S))
+
+
+def test_a_file_that_is_larger_than_any_image_is_not_downloaded():
+    """Blocks of no bytes, or of few of a file of 4 GB, kept a session busy without end."""
+    device = Device()
+    real = device.telemetry
+
+    async def telemetry(name):
+        wrong = {"size": 2**32 - 1} if name == "file_info" and device.listed == 0 else {}
+        return {**await real(name), **wrong}
+
+    device.telemetry = telemetry
+    with pytest.raises(BenchError, match=r"file_info.size: 4294967295 bytes are no image"):
         asyncio.run(download_by_bursts(device, "size_64", within_s=PATIENCE_S))
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import socket
 import socketserver
 import threading
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
@@ -18,7 +20,7 @@ from starhil.protocol.icd.conventions import Conventions
 
 pytestmark = pytest.mark.long
 
-Answer = Callable[[dict], dict | None]
+Answer = Callable[[dict], dict | bytes | None]
 
 
 @pytest.fixture
@@ -38,7 +40,8 @@ def channel():
                         requests.append(json.loads(line))
                         if (reply := answer(requests[-1])) is None:
                             return
-                        self.wfile.write(json.dumps(reply).encode() + b"\n")
+                        text = reply if isinstance(reply, bytes) else json.dumps(reply).encode()
+                        self.wfile.write(text + b"\n")
 
             server: socketserver.BaseServer
             if path is None:
@@ -82,6 +85,48 @@ def test_a_rejection_and_the_end_of_the_channel_are_reported(channel, answer, me
     _, address = channel(lambda _request: answer)
     with ControlClient(address) as client, pytest.raises(BenchError, match=message):
         client.do("fault")
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        b"HTTP/1.1 400 Bad Request",
+        b"< hi >",
+        b"{}",
+        b"[]",
+        b"5",
+        b"null",
+        b'{"ok": true}',
+        b'{"ok": false}',
+        b'{"ok": 1, "mode": 2',
+        b"{\xff}",
+        b'{"ok":' * 100_000,
+    ],
+    ids=lambda answer: answer[:20],
+)
+def test_a_peer_that_is_no_control_channel_is_reported_in_one_line(channel, answer):
+    """The address of the console in its place ended in a traceback."""
+    _, address = channel(lambda _request: answer)
+    with ControlClient(address) as client, pytest.raises(BenchError) as refusal:
+        assert client.do("status")["clock"]
+    assert str(refusal.value) == (
+        f"control channel: status: {address} does not answer as an emulator; give the address `control=` of its ready line"
+    )
+
+
+def test_a_peer_that_sends_no_end_of_a_line_is_given_up_at_once_or_in_time(channel, monkeypatch):
+    monkeypatch.setattr(control, "ANSWER_WITHIN_S", 0.3)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"127.0.0.1:{server.getsockname()[1]}"
+        for sent, said in ((b"< hi >", "does not answer as an emulator"), (b"{", "no answer: timed out")):
+            with ControlClient(address) as client:
+                peer, _ = server.accept()
+                with peer:
+                    peer.sendall(sent)
+                    begin_s = time.monotonic()
+                    with pytest.raises(BenchError, match=said):
+                        client.do("status")
+                    assert time.monotonic() - begin_s < 30.0
 
 
 @pytest.mark.parametrize("address", ["unix:/no/such/socket", "127.0.0.1:1", "127.0.0.1:x"])

@@ -5,9 +5,11 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
+import socket
 import termios
 import time
 import tty
+from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
 
@@ -16,8 +18,9 @@ import serial
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import TransportError
+from starhil.protocol.transports.connections import ACCEPTING_S
 from starhil.protocol.transports.paced import BACKLOG_LIMIT, LONG_TURN_S, PacedTransport
-from starhil.protocol.transports.serial import open_serial
+from starhil.protocol.transports.serial import _ListenTransport, open_serial
 from tests.conformance.simulated import SimulatedLoop
 from tests.protocol.transports.pairs import SERIAL_KINDS, serial_pair
 from tests.waiting import PATIENCE_S, until
@@ -210,6 +213,30 @@ def test_a_listening_port_serves_one_peer_at_a_time_and_the_next_after_it() -> N
         await one.close()
 
     asyncio.run(main())
+
+
+def test_a_listening_port_accepts_connections_with_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    accepted: list[float] = []
+    made = _ListenTransport.connection_made
+
+    def noted(self: _ListenTransport, transport: asyncio.BaseTransport) -> None:
+        accepted.append(asyncio.get_running_loop().time())
+        made(self, transport)
+
+    monkeypatch.setattr(_ListenTransport, "connection_made", noted)
+
+    async def main() -> None:
+        port = open_serial("listen://127.0.0.1:0")
+        await port.start(lambda _: None)
+        host, _, number = port.description.removeprefix("socket://").rpartition(":")
+        peers = [socket.create_connection((host, int(number))) for _ in range(10)]
+        await until(lambda: len(accepted) == len(peers))
+        for peer in peers:
+            peer.close()
+        await port.close()
+
+    asyncio.run(main())
+    assert min(after - before for before, after in pairwise(accepted)) >= ACCEPTING_S
 
 
 def test_pyserial_opens_our_pseudo_terminal_and_our_socket(tmp_path: Path) -> None:

@@ -285,6 +285,23 @@ def test_a_bright_light_that_is_not_identified_is_explained(tmp_path):
     assert "bright at (600, 300) px, not identified" in starid("identify", str(image)).output
 
 
+def test_stars_of_the_catalogue_in_one_spot_are_not_called_a_planet(tmp_path):
+    image = tmp_path / "sky.png"
+    orion = [
+        "--ra",
+        "84",
+        "--dec",
+        "-1",
+        "--fov",
+        "20",
+        "--size",
+        "640x480",
+    ]  # with theta Orionis: four stars in two pixels
+    assert starhil("render", *orion, "-o", str(image)).exit_code == 0
+    (light,) = answer(image, "--fov", "20")["unidentified"]
+    assert light["why"] == "4 stars of the catalogue in one spot, so its place is that of none"
+
+
 def test_a_solution_prints_as_five_lines(tmp_path):
     image = tmp_path / "sky.png"
     assert starhil("render", "--ra", "83.8", "--dec", "-1.2", "-o", str(image)).exit_code == 0
