@@ -75,6 +75,24 @@ _ORBIT_COLUMNS: Final[tuple[Column, ...]] = (
     ("%", lambda row: f"{row['share_pct']:.1f}"),
 )
 
+_TRACKING_COLUMNS: Final[tuple[Column, ...]] = (
+    ("last image solved", lambda row: row["way"]),
+    ("images", lambda row: str(row["frames"])),
+    ("valid", lambda row: str(row["valid"])),
+    ("wrong", lambda row: str(row["wrong"])),
+    ("across median, 99 % arcsec", lambda row: _pair(row, "cross_median_arcsec", "cross_p99_arcsec")),
+    ("about", lambda row: _pair(row, "roll_median_arcsec", "roll_p99_arcsec")),
+    ("chi2", _number("normalised_squared_error", 2)),
+    ("stars", _number("matched_median", 0)),
+    ("detect ms", _number("detect_ms", 2)),
+    ("identify ms", _number("identify_ms", 2)),
+)
+
+
+def _pair(row: dict[str, Any], first: str, second: str) -> str:
+    return "" if row[first] is None else f"{row[first]:.0f}, {row[second]:.0f}"
+
+
 group = typer.Typer(
     help="Measure the accuracy and reliability of attitudes over many rendered images (for speed and solvers, see bench).",
     invoke_without_command=True,
@@ -424,6 +442,53 @@ def orbit_campaign(
     else:
         print_table(_ORBIT_COLUMNS, rows)
     if any(row["frames"] for row in rows if row["cause"] == "wrong"):
+        raise typer.Exit(1)
+
+
+@group.command("tracking")
+def tracking(
+    *,
+    profile: Annotated[
+        str, typer.Option(help="Device profile: a name or a TOML file.", autocompletion=names_of("profile"))
+    ] = "cubestar",
+    setting: Settings = None,
+    frames: Annotated[int, typer.Option(min=1, help="Number of images that count.")] = 1000,
+    seed: Seed = 1,
+    blocked: Annotated[
+        float, typer.Option(help="Fraction of the field hidden in these images, 0 to 1.")
+    ] = 0.75,
+    rate: Annotated[float, typer.Option(min=0, help="Body rate, deg/s, about a random axis.")] = 0.0,
+    jump: Annotated[
+        float,
+        typer.Option(
+            min=0, help="Largest turn before these images that the device does not expect, degrees."
+        ),
+    ] = 0.0,
+    jobs: Jobs = 1,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            help="Folder for finished parts, created if missing. A second run resumes from it.",
+        ),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Track through images of which most is hidden, after some that show the whole field.
+
+    The same images are solved lost in space, and with the prediction from the attitudes before. An image is wrong if its attitude is
+    valid but off by more than 0.1 deg. The exit status is 1 if any is wrong.
+    """
+    from starhil.emulator.benchmarks.tracking_campaign import TrackingPlan, run_tracking, summarise
+
+    plan = TrackingPlan(profile, tuple(setting or ()), seed, frames, blocked, rate, jump)
+    rows = summarise(list(_with_progress(run_tracking(plan, folder=output, jobs=jobs), plan.chunks)))
+    if as_json:
+        print(json.dumps(rows))
+    else:
+        print_table(_TRACKING_COLUMNS, rows)
+    if any(row["wrong"] for row in rows):
         raise typer.Exit(1)
 
 

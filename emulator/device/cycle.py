@@ -268,8 +268,13 @@ class FrameCycle:
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
         request = self._request(start_ns, truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
         if predicted is not None and self._parameters["prediction_enable"]:
-            error = self._history.covariance(mid_ns)
-            request = replace(request, prediction_covariance=error, predicted_rate_rad_s=self._history.rate())
+            covariance, freedom = self._history.uncertainty(mid_ns) or (None, math.inf)
+            request = replace(
+                request,
+                prediction_covariance=covariance,
+                prediction_freedom=freedom,
+                predicted_rate_rad_s=self._history.rate(),
+            )
         self._in_flight.append(frame)
         ready_ns = self._ready_ns(start_ns, exposure_s, period_s, tracking=frame.tracking)
         self._imager.submit(request, self._until_stopped(partial(self._result_arrived, frame)))
@@ -433,7 +438,8 @@ class FrameCycle:
             return False, result.reason, None
         attitude = Attitude(np.array(result.quaternion_xyzw))
         known = None if result.covariance_rad2 is None else np.array(result.covariance_rad2)
-        self._history.add(frame.mid_ns, attitude, LONGEST_GAP_PERIODS * frame.period_s, known)
+        gap_s = LONGEST_GAP_PERIODS * frame.period_s
+        self._history.add(frame.mid_ns, attitude, gap_s, known, result.freedom)
         rate = result.rate_rad_s or self._history.rate()
         if processing_s * 1000.0 > float(self._parameters["detection_timeout"]):
             return False, "timeout", rate

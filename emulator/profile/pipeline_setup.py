@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TypeAlias
 
 from starhil.emulator.profile.profile import Profile
@@ -47,7 +46,8 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
         previews=previews,
         dark_frames=profile.device.dark_frames,
         tracking_stars=profile.device.tracking_stars,
-        largest_error_rad=math.radians(profile.device.largest_error_deg),
+        largest_error_deg=profile.device.largest_error_deg,
+        wrong_predictions=profile.device.wrong_predictions,
         tracking_windows=profile.device.tracking_windows,
         calibration=profile.calibration.matrix(),
         exposure_s=float(profile.parameters.get("exposure", 200)) / 1000.0,

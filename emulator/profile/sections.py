@@ -115,7 +115,10 @@ class DeviceConfig(Strict):
     (3 sigmas). 0: `min_stars_matched`, as lost in space."""
     largest_error_deg: Annotated[float, Field(ge=0.001, le=10.0)] = 0.1
     """Largest error across or about the boresight that an attitude may have, degrees: it is invalid if, by its own uncertainty, a
-    larger one is likelier than 1e-4, or, with few stars in tracking, if an error of the prediction could cause one unnoticed."""
+    larger one is likelier than 1e-4. With few stars in tracking, that includes errors of the prediction that the stars do not show."""
+    wrong_predictions: Annotated[float, Field(ge=0.0, le=1.0)] = 0.001
+    """Share of the predicted attitudes that are assumed to be wrong by more than their uncertainty, because the body accelerates. The
+    larger it is, the more stars an attitude in tracking needs."""
     tracking_windows: bool = False
     """Whether the unit searches only windows around the predicted stars when it tracks, and the whole image only if that fails."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0

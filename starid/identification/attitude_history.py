@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Final
 
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike
 from starid.arithmetic.arrays import Array
 from starid.arithmetic.elementary import square
 from starid.attitude import Attitude, propagate
+from starid.identification.error_risk import combined_freedom
 
 RATE_SPAN_S: Final = 2.0
 """Age up to which attitudes are used for the rate, seconds; the last two are always used."""
@@ -22,7 +24,7 @@ class AttitudeHistory:
     def __init__(self, window: int, per_second: float = 1.0) -> None:
         self._per_second = per_second
         self._fixes: deque[tuple[float, Attitude]] = deque(maxlen=window)
-        self._errors: deque[Array] = deque(maxlen=window)
+        self._errors: deque[tuple[Array, float]] = deque(maxlen=window)
         self._interrupted = False
 
     def interrupt(self) -> None:
@@ -41,9 +43,14 @@ class AttitudeHistory:
         return self._fixes[-1] if self._fixes else None
 
     def add(
-        self, at: float, attitude: Attitude, longest_gap_s: float, covariance: Array | None = None
+        self,
+        at: float,
+        attitude: Attitude,
+        longest_gap_s: float,
+        covariance: Array | None = None,
+        freedom: float = math.inf,
     ) -> None:
-        """Add an attitude, with the covariance (3, 3) of its error, rad², if known.
+        """Add an attitude, with the covariance (3, 3) of its error, rad², if known, and the degrees of freedom of that.
 
         Older ones are discarded after an interruption, after a longer gap, or if time has not passed.
         """
@@ -53,23 +60,26 @@ class AttitudeHistory:
             self._errors.clear()
         self._interrupted = False
         self._fixes.append((at, attitude))
-        self._errors.append(np.full((3, 3), np.nan) if covariance is None else covariance)
+        self._errors.append((np.full((3, 3), np.nan) if covariance is None else covariance, freedom))
 
     def rate(self) -> tuple[float, float, float] | None:
         """Return the least-squares body rate over the attitudes, sensor frame, rad/s; None for fewer than two."""
         if len(self._fixes) < 2:
             return None
-        latest, newest = self._fixes[-1]
-        recent = [
-            (time, attitude)
-            for n, (time, attitude) in enumerate(reversed(self._fixes))
-            if n < 2 or latest - time <= RATE_SPAN_S * self._per_second
-        ]
-        times = np.array([(time - latest) / self._per_second for time, _ in recent])
+        _, newest = self._fixes[-1]
+        weights = self._rate_weights()
+        recent = list(self._fixes)[: -len(weights) - 1 : -1]
         turns = np.array([attitude.error_to(newest).rotation_vector_rad for _, attitude in recent])
-        times -= times.mean()
-        x, y, z = (np.sum(times[:, None] * turns, axis=0) / np.sum(square(times))).tolist()
+        x, y, z = np.sum(weights[:, None] * turns, axis=0).tolist()
         return (x, y, z)
+
+    def _rate_weights(self) -> Array:
+        """Weights, 1/s, of the last attitudes in the rate, newest first: those of a straight line fitted to them."""
+        latest, _ = self._fixes[-1]
+        ages = [(time - latest) / self._per_second for time, _ in reversed(self._fixes)]
+        times = np.array([age for n, age in enumerate(ages) if n < 2 or -age <= RATE_SPAN_S])
+        times -= times.mean()
+        return np.asarray(times / np.sum(square(times)))
 
     def predict(self, at: float, rate_rad_s: ArrayLike | None) -> Attitude | None:
         """Return the attitude at a later time, with a body rate since the last one; without a rate, the last one."""
@@ -78,15 +88,20 @@ class AttitudeHistory:
         since, last = self._fixes[-1]
         return last if rate_rad_s is None else propagate(last, rate_rad_s, (at - since) / self._per_second)
 
-    def covariance(self, at: float) -> Array | None:
-        """Return the covariance (3, 3), rad², of the error of `predict` with the rate of `rate`; None if it is not known.
+    def uncertainty(self, at: float) -> tuple[Array, float] | None:
+        """Return the covariance (3, 3), rad², of the error of `predict` with the rate of `rate`, and its degrees of freedom.
 
-        At a constant rate, a line through two attitudes with errors of covariances C₁ and C₂, a time Δ apart, has an error of
-        ``(1 + n)² C₂ + n² C₁`` a time n·Δ after the second. More attitudes have less.
+        None if it is not known. At a constant rate the prediction is a sum of the attitudes, with the weights of the rate times the time
+        since the last one, and one more for that; their errors are taken to be independent.
         """
         if len(self._fixes) < 2 or at <= self._fixes[-1][0]:
             return None
-        before, last = self._fixes[-2][0], self._fixes[-1][0]
-        steps = (at - last) / (last - before)
-        covariance = square(1.0 + steps) * self._errors[-1] + square(steps) * self._errors[-2]
-        return covariance if np.isfinite(covariance).all() else None
+        weights = self._rate_weights() * ((at - self._fixes[-1][0]) / self._per_second)
+        weights[0] += 1.0
+        recent = list(self._errors)[: -len(weights) - 1 : -1]
+        parts = [
+            (square(weight) * covariance, freedom)
+            for weight, (covariance, freedom) in zip(weights.tolist(), recent, strict=True)
+        ]
+        covariance = np.sum([part for part, _ in parts], axis=0)
+        return (covariance, combined_freedom(*parts)) if np.isfinite(covariance).all() else None

@@ -16,6 +16,12 @@ WIDEST_TOLERANCE: Final = 0.3
 REGION_DEG: Final = 2.0
 """Least side of a region of search, degrees."""
 
+LARGEST_ERROR_DEG: Final = 0.1
+"""Largest error across or about the boresight that an attitude may have, degrees."""
+
+UNLIMITED_DEG: Final = 180.0
+"""The same where any error may remain."""
+
 _TAU_REFINED: Final = 1.0
 _TAU_ALONE: Final = 0.5
 
@@ -32,6 +38,9 @@ class GeometricOptions:
         Relative uncertainty of the focal length, 0 for a calibrated camera. If not 0, solutions refine it.
     blend_px
         Stars closer than this are merged, pixels.
+    largest_error_deg
+        Largest error across or about the boresight, degrees: an attitude is invalid if, by its own uncertainty, a larger one is
+        likelier than 1e-4 (`starid.identification.error_risk`).
     cache
         Whether the index is kept in the cache folder, or the folder to keep it in.
     """
@@ -39,6 +48,7 @@ class GeometricOptions:
     limiting_magnitude: float | None = None
     fov_tolerance: float = 0.0
     blend_px: float = 2.0
+    largest_error_deg: float = LARGEST_ERROR_DEG
     cache: bool | str | Path = True
 
     def __post_init__(self) -> None:
@@ -46,6 +56,14 @@ class GeometricOptions:
             raise StaridError(
                 f"identifier fov_tolerance: must be 0…{WIDEST_TOLERANCE:g}, not {self.fov_tolerance}"
             )
+        _check_largest_error(self.largest_error_deg)
+
+
+def _check_largest_error(degrees: float) -> None:
+    if not 0.0 < degrees <= UNLIMITED_DEG:
+        raise StaridError(
+            f"identifier largest_error_deg: must be above 0 and at most {UNLIMITED_DEG:g}, not {degrees}"
+        )
 
 
 @dataclass(frozen=True)
@@ -81,6 +99,8 @@ class LsiOptions:
         the next frame that value is tried first, and then guesses from the frame.
     limiting_magnitude
         Faintest V of the verification (see `Identifier`).
+    largest_error_deg
+        As for a geometric identifier; for refined attitudes only.
     database
         Feature database to use instead of the cached one.
     cache
@@ -103,12 +123,14 @@ class LsiOptions:
     neighbours: int = 10_000
     zero_point: float | None = None
     limiting_magnitude: float | None = None
+    largest_error_deg: float = LARGEST_ERROR_DEG
     database: str | Path | None = None
     cache: bool = True
     divided: bool = False
     solver: Solver = "exact"
 
     def __post_init__(self) -> None:
+        _check_largest_error(self.largest_error_deg)
         if self.neighbours < 1:
             raise StaridError(f"lsi neighbours: must be at least 1, not {self.neighbours}")
         if not (self.threshold > 0.0 and self.invalid_factor > 0.0):

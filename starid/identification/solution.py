@@ -117,6 +117,8 @@ class Solution:
         Hipparcos numbers of the matched catalogue stars.
     covariance : ndarray (3, 3)
         Covariance of the rotation vector e in the sensor frame, rad²: attitude = ``truth.rotated(e)``.
+    freedom : float
+        Degrees of freedom from which the scale of the covariance was estimated; NaN if it was not estimated from residuals.
     rms_px : float
         Root mean square distance between matched detections and their predicted positions, pixels.
     sigma_px : float
@@ -142,6 +144,7 @@ class Solution:
     catalog_index: Indices = field(default_factory=_NO_INDEX.copy)
     hip: Indices32 = field(default_factory=_NO_HIP.copy)
     covariance: Array = field(default_factory=lambda: _nan(3, 3))
+    freedom: float = math.nan
     rms_px: float = math.nan
     sigma_px: float = math.nan
     probability_false: float = 1.0

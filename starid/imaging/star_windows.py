@@ -7,7 +7,7 @@ block of its centre, the background of a tile depends on its own pixels only: an
 from __future__ import annotations
 
 import dataclasses
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,10 @@ MAX_RADIUS_PX: Final = BLOCK_PX / 2.0
 _RIVAL_SHARE: Final = 0.4
 """Flux from which another detection is like a star, as a share of the star's: a magnitude."""
 
+_NOISE_SIGMA: Final = 5.0
+_CLEARLY_SIGMA: Final = 2.0
+"""On an even background, a peak below five sigmas, as noise has them, is not like a star that is two sigmas higher."""
+
 _UNEVEN_SIGMA: Final = 1.0
 """Difference of the background in the quarters of a tile, in sigmas of a pixel, from which it is not smooth."""
 
@@ -34,20 +38,28 @@ _MIN_EDGE_PX: Final = 8
 """Places nearer to the edge of the image are left out: the windows of their stars would extend into other tiles."""
 
 
-def detect_near(
-    image: GreyImage, places: Array, radius_px: float, settings: DetectionSettings
-) -> tuple[Detections, Array]:
-    """Find the stars near places (m, 2) of an image (h, w).
+class Windows(NamedTuple):
+    """What is seen near places.
 
-    Returns
-    -------
+    Attributes
+    ----------
     found : Detections
-        Stars within `radius_px` of a place, each once, brightest first. Trails are not followed.
+        Stars near a place, each once, brightest first. Trails are not followed.
     rivals : ndarray (n,)
         Other detections around the places, at most a magnitude fainter, per square pixel and summed over the places: times an
         area, the mean number of such detections that lie by chance in windows of that area. Where the background is uneven, as at
         the edge of a body, they are counted apart.
+    searched : ndarray (m,) bool
+        Whether anything can be found at each place: not where the image is constant, nor close to its edge.
     """
+
+    found: Detections
+    rivals: Array
+    searched: Mask
+
+
+def detect_near(image: GreyImage, places: Array, radius_px: float, settings: DetectionSettings) -> Windows:
+    """Find the stars within a radius of places (m, 2) of an image (h, w)."""
     if not 0.0 < radius_px <= MAX_RADIUS_PX:
         raise StaridError(f"radius_px: must be above 0 and at most {MAX_RADIUS_PX:g}, not {radius_px:g}")
     height, width = image.shape
@@ -59,7 +71,7 @@ def detect_near(
     used = np.flatnonzero(inner)
     if used.size == 0:
         empty = np.full((TILE_PX, TILE_PX), 0, dtype=image.dtype)
-        return detect(empty, settings), np.zeros(0)
+        return Windows(detect(empty, settings), np.zeros(0), np.zeros(len(places), dtype=np.bool_))
     columns = int(np.ceil(np.sqrt(used.size)))
     rows = -(-used.size // columns)
     corners = np.clip(
@@ -84,7 +96,12 @@ def detect_near(
     off = xy[:, None, :] - places[None, :, :]
     elsewhere = around & ~(np.sum(square(off), axis=2) <= radius_px * radius_px).any(axis=1)
     uneven = _uneven_tiles(mosaic, (rows, columns))[tile]
+    searched = np.zeros(len(places), dtype=np.bool_)
+    searched[used] = (tiles.max(axis=(1, 3)) > tiles.min(axis=(1, 3))).ravel()[: used.size]
+    ratio = detections.flux / detections.flux_sigma
+    no_noise = ratio >= np.minimum(ratio - _CLEARLY_SIGMA, _NOISE_SIGMA)[:, None]
     alike = (detections.flux >= _RIVAL_SHARE * detections.flux[:, None]) & (uneven == uneven[:, None])
+    alike &= uneven | no_noise
     count = np.count_nonzero(elsewhere & alike, axis=1)
     rivals = count / (np.pi * (square(MAX_RADIUS_PX) - square(radius_px)))
     near = np.flatnonzero(around & (distance <= radius_px))
@@ -92,7 +109,7 @@ def detect_near(
     pixel = np.rint(xy[near]).astype(np.int64)
     _, once = np.unique(pixel[:, 1] * width + pixel[:, 0], return_index=True)
     kept = np.sort(near[once])
-    return _chosen(detections, xy, kept), rivals[kept]
+    return Windows(_chosen(detections, xy, kept), rivals[kept], searched)
 
 
 def _uneven_tiles(mosaic: GreyImage, shape: tuple[int, int]) -> Mask:

@@ -21,6 +21,7 @@ from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
 from starid.identification.geometric.identifier import Effort, Identifier, scaled_camera
+from starid.identification.options import UNLIMITED_DEG
 from starid.identification.solution import Reason, Solution
 from starid.photograph.typical_camera import typical_camera
 
@@ -121,6 +122,7 @@ class RoughSearch:
             camera,
             catalog,
             fov_tolerance=fov_tolerance,
+            largest_error_deg=UNLIMITED_DEG,
             effort=self._scaled(_LENIENT),
             index_camera=typical_camera(camera),
         )

@@ -18,8 +18,10 @@ from starid.arithmetic.arrays import Array, GreyImage
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
+from starid.identification.error_risk import flagged
 from starid.identification.geometric.answer import MIN_MATCHED
 from starid.identification.geometric.identifier import Identifier
+from starid.identification.options import LARGEST_ERROR_DEG
 from starid.identification.solution import Reason, Solution
 from starid.imaging.detection import Detections, DetectionSettings, detect
 from starid.photograph.rough_search import RoughSearch
@@ -243,7 +245,7 @@ def refine_solution(
     )
     if again.valid:
         solution = dataclasses.replace(again, mode="lost_in_space", camera=refined)
-    solution = solution.timed(begin)
+    solution = flagged(solution, LARGEST_ERROR_DEG).timed(begin)
     seen = identifier.stars.aberrated(observer_velocity)
     return ImageSolution(solution, detections, solution.camera or camera, seen, view.mirrored)
 

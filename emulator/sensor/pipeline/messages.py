@@ -112,8 +112,10 @@ class PipelineSetup:
     exact."""
     tracking_stars: int = 2
     """Least number of stars in tracking if the error of the prediction is known; 0: as lost in space."""
-    largest_error_rad: float = math.radians(0.1)
-    """Largest error of an attitude across or about the boresight, radians; see `largest_error_deg` of a profile."""
+    largest_error_deg: float = 0.1
+    """Largest error of an attitude across or about the boresight, degrees; see `[device]` of a profile."""
+    wrong_predictions: float = 1e-3
+    """Share of predictions that are assumed to be wrong; see `[device]` of a profile."""
     tracking_windows: bool = False
     """Whether to search only windows around predicted stars first, when tracking."""
     exposure_s: float = 0.2
@@ -162,6 +164,8 @@ class FrameRequest:
     """Predicted attitude at mid-exposure, for tracking; None: lost in space."""
     prediction_covariance: Array | None = None
     """Covariance (3, 3) of its error, rad², sensor frame; None: not known."""
+    prediction_freedom: float = math.inf
+    """Degrees of freedom of that."""
     predicted_rate_rad_s: Triple | None = None
     """Body rate at the prediction; None: not known."""
     faults: dict[str, Any] = field(default_factory=dict)
@@ -245,6 +249,8 @@ class FrameResult:
     """Standard deviation about the axis across the boresight about which it is largest, and about the boresight."""
     covariance_rad2: Matrix | None = None
     """Covariance of the rotation vector of the error, sensor frame; None if invalid."""
+    freedom: float = math.inf
+    """Degrees of freedom from which its scale was estimated."""
     rate_rad_s: Triple | None = None
     """Body rate, if the algorithm estimates one."""
     detected: int = 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import itertools
+import math
 import subprocess
 import time
 from dataclasses import dataclass, field, replace
@@ -57,13 +58,13 @@ from starid.camera.position_errors import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
 from starid.catalog.aberration import aberrated
 from starid.errors import StaridError
-from starid.identification.error_risk import error_risk, largest_across_rad
+from starid.identification.error_risk import flagged, largest_across_rad, rejected
 from starid.identification.geometric.identifier import Effort
 from starid.identification.geometric.index_choice import pixels_per_radian
 from starid.identification.geometric.pattern_index import resolved_stars
 from starid.identification.geometric.refinement import PRIOR_FREEDOM
 from starid.identification.options import GeometricOptions
-from starid.identification.predicted_stars import expected_places, solve_with_prediction
+from starid.identification.predicted_stars import Prediction, expected_places, solve_with_prediction
 from starid.identification.solution import Reason, Solution
 from starid.identification.star_identifier import StarIdentifier
 from starid.imaging.detection import Detections, DetectionSettings, detect
@@ -85,9 +86,6 @@ _LONGEST_STILL_PX: Final = 1.0
 """Longest trail of a star that is taken for a spot."""
 
 _MAX_FALSE_PROBABILITY: Final = Effort().max_false_probability_tracking
-
-_MAX_ERROR_RISK: Final = 1e-4
-"""Largest risk of an error above the largest one: of 10 000 images, all at this limit, one would be wrong. Most are far below."""
 
 _WARM_UP_EXPOSURE_S: Final = 1.0
 """Exposure in which a dim sensor too sees enough stars to follow their trails, seconds."""
@@ -236,13 +234,11 @@ class Pipeline:
         windows = self._detect_predicted(exposure, request, sensor)
         detections = self._detect(exposure, request, sensor) if windows is None else windows
         detected = time.perf_counter()
-        solution = self._solve(identifier, detections, request)
+        detections, solution = self._solve_or_follow(exposure, request, sensor, identifier, detections)
         if windows is not None and not solution.valid:
-            detections = self._detect(exposure, request, sensor)
+            whole = self._detect(exposure, request, sensor)
             detected = time.perf_counter()
-            solution = self._solve(identifier, detections, request)
-        if not solution.valid or _less_certain(solution, request):
-            detections, solution = self._follow(exposure, request, sensor, identifier, detections, solution)
+            detections, solution = self._solve_or_follow(exposure, request, sensor, identifier, whole)
         solved = time.perf_counter()
         times = (begin, rendered, detected, solved)
         result = self._frame_result(request, sensor, detections, solution, identifier, times)
@@ -375,19 +371,35 @@ class Pipeline:
             reason = (
                 Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
             )
-            return _rejected(solution, reason)
+            return rejected(solution, reason)
         if self._calibration is not None:
             camera, used = calibrated_camera(self.camera, settings), solution.detection_index
             covariance, noise_px = attitude_covariance(
                 camera, self._calibration, xy[used], errors[used], offsets, PRIOR_FREEDOM
             )
-            solution = replace(solution, covariance=covariance, sigma_px=noise_px)
-        return _rejected(solution, Reason.TOO_FEW_STARS) if self._may_be_wrong(solution) else solution
+            solution = flagged(
+                replace(solution, covariance=covariance, sigma_px=noise_px), self._largest_error_deg
+            )
+        return solution
 
-    def _may_be_wrong(self, solution: Solution) -> bool:
-        """Whether a valid attitude may be off by more than the largest error, by its own uncertainty."""
-        freedom = 2.0 * solution.star_count - 3.0 + PRIOR_FREEDOM
-        return error_risk(solution.covariance, freedom, self._setup.largest_error_rad) > _MAX_ERROR_RISK
+    @property
+    def _largest_error_deg(self) -> float:
+        """Largest error of an attitude, degrees: the star identifier's, by default that of the device."""
+        return float(self._setup.identifier.get("largest_error_deg", self._setup.largest_error_deg))
+
+    def _solve_or_follow(
+        self,
+        exposure: _Exposure,
+        request: FrameRequest,
+        sensor: SensorModel,
+        identifier: StarIdentifier,
+        detections: Detections,
+    ) -> tuple[Detections, Solution]:
+        """Identify detections; if that gives no attitude, or one that is less certain than the prediction, combine stars with it."""
+        solution = self._solve(identifier, detections, request)
+        if solution.valid and not _less_certain(solution, request):
+            return detections, solution
+        return self._follow(exposure, request, sensor, identifier, detections, solution)
 
     def _follow(
         self,
@@ -420,14 +432,15 @@ class Pipeline:
             min_star_pixels=0,
             psf_sigma_px=sensor.mean_psf_sigma_px,
         )
-        seen, rivals = detect_near(image, places, _window_px(settings), faint)
+        seen, rivals, searched = detect_near(image, places, _window_px(settings), faint)
         solution = solve_with_prediction(
-            camera, stars, seen, predicted, covariance,
-            2.5 * log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY,
-            self._setup.largest_error_rad, rivals=rivals, observer_velocity=request.observer_velocity, known=self._calibration,
+            camera, stars, seen, Prediction(predicted, covariance, request.prediction_freedom),
+            2.5 * log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY, self._largest_error_deg,
+            wrong_predictions=self._setup.wrong_predictions, rivals=rivals, searched=searched,
+            observer_velocity=request.observer_velocity, known=self._calibration,
         )  # fmt: skip
-        if not solution.valid or solution.star_count < least or self._may_be_wrong(solution):
-            return detections, _rejected(failed, Reason.PREDICTION_LOST) if failed.valid else failed
+        if not solution.valid or solution.star_count < least:
+            return detections, rejected(failed, Reason.PREDICTION_LOST) if failed.valid else failed
         rows = identifier.catalog.index_of(solution.hip).astype(np.int64)
         return seen, replace(solution, catalog_index=rows)
 
@@ -442,8 +455,7 @@ class Pipeline:
         stars = self._tracked_stars(settings.limiting_magnitude)
         places = self._predicted_places(predicted, request, stars)
         image, known = self._detection(exposure, request, sensor)
-        found, _ = detect_near(image, places[: settings.max_stars_matched], _window_px(settings), known)
-        return found
+        return detect_near(image, places[: settings.max_stars_matched], _window_px(settings), known).found
 
     def _leaves_trails(self, request: FrameRequest) -> bool:
         """Whether stars leave trails at the predicted rate: only the whole image shows how they run."""
@@ -477,6 +489,7 @@ class Pipeline:
         setup, settings = self._setup, request.settings
         options: dict[str, Any] = {**setup.identifier}
         options.setdefault("limiting_magnitude", settings.limiting_magnitude)
+        options["largest_error_deg"] = self._largest_error_deg
         if setup.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
             options.setdefault("zero_point", 2.5 * log10(self._sensor.zero_magnitude_e_s))
             options.setdefault("colour_term", self._sensor.colour_term)
@@ -547,6 +560,7 @@ class Pipeline:
             sigma_cross_arcsec=largest_across_rad(solution.covariance) * ARCSEC_PER_RAD if valid else 0.0,
             sigma_roll_arcsec=solution.roll_sigma_arcsec if valid else 0.0,
             covariance_rad2=as_rows(solution.covariance) if valid else None,
+            freedom=solution.freedom if valid else math.inf,
             rate_rad_s=None if rate is None else (float(rate[0]), float(rate[1]), float(rate[2])),
             detected=len(detections.flux),
             refused=detections.rejected,
@@ -584,12 +598,6 @@ def _offsets(identifier: StarIdentifier, solution: Solution, xy: Array, request:
 def _camera_of(solution: Solution, identifier: StarIdentifier) -> Camera:
     """Return the camera with which an attitude was found: the calibrated one, or that one refined by the solution."""
     return identifier.camera if solution.camera is None else solution.camera
-
-
-def _rejected(solution: Solution, reason: Reason) -> Solution:
-    """Return an invalid solution in place of one that is not good enough."""
-    rejected = Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
-    return replace(rejected, features=solution.features)
 
 
 def _less_certain(solution: Solution, request: FrameRequest) -> bool:

@@ -23,6 +23,7 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.catalog.aberration import checked_beta
 from starid.errors import StaridError
+from starid.identification.error_risk import flagged
 from starid.identification.geometric.answer import MIN_MATCHED, Answer
 from starid.identification.geometric.index_choice import (
     default_limiting_magnitude,
@@ -32,6 +33,7 @@ from starid.identification.geometric.index_choice import (
     pixels_per_radian,
 )
 from starid.identification.geometric.pattern_index import IndexArrays, field_solid_angle
+from starid.identification.geometric.refinement import PRIOR_FREEDOM
 from starid.identification.geometric.search import identify_kernel
 from starid.identification.geometric.settings import ACCEPTED, SETTINGS, TOO_FEW
 from starid.identification.geometric.tracking import MIN_TRACKED, MIN_TRACKED_KNOWN, track_kernel
@@ -159,6 +161,7 @@ class Identifier(SingleCameraIdentifier):
         self._stars = obtain_stars(self._catalog, settings, options.cache)
         self._rows = self._catalog.index_of(self._stars.hip).astype(np.int64)
         self._set_index(obtain_index(self._stars, settings, options.cache))
+        self._largest_error_deg = options.largest_error_deg
         self._configure(camera, options.fov_tolerance, effort)
 
     def _set_index(self, index: IndexArrays) -> None:
@@ -189,8 +192,8 @@ class Identifier(SingleCameraIdentifier):
     def _identify(self, measured: CheckedDetections) -> Solution:
         if self._fov_tolerance > 0.0:
             return self._identify_any_scale(measured)
-        answer = self._search(self._camera, measured, self._numbers_for(measured))
-        return self._solution(answer, "lost_in_space")
+        numbers = self._numbers_for(measured)
+        return self._solution(self._search(self._camera, measured, numbers), numbers, "lost_in_space")
 
     def _search(self, camera: Camera, measured: CheckedDetections, numbers: Records) -> Answer:
         """Search the whole sky with a given camera and kernel settings."""
@@ -229,7 +232,7 @@ class Identifier(SingleCameraIdentifier):
             numbers["max_triangles"], numbers["part_stars"] = triangles, part_stars
             for camera in cameras:
                 answer = self._search(camera, measured, numbers)
-                solution = self._solution(answer, "lost_in_space")
+                solution = self._solution(answer, numbers, "lost_in_space")
                 if solution.valid:
                     found = scaled_camera(camera, 1.0 / float(answer.numbers[3]))
                     false = min(solution.probability_false * len(cameras), 1.0)
@@ -272,7 +275,7 @@ class Identifier(SingleCameraIdentifier):
             self._camera.params, measured.xy, measured.flux, measured.sigmas, numbers,
             predicted.matrix, window, least, prior,
         )  # fmt: skip
-        return self._solution(answer, "tracking")
+        return self._solution(answer, numbers, "tracking")
 
     def _prior(self, window_rad: float) -> tuple[float, float]:
         """Prior volume of rotations within a window, rad³, and solid angle of the window."""
@@ -328,14 +331,16 @@ class Identifier(SingleCameraIdentifier):
         other._set_index(self._index._replace(stars=stars))
         return other
 
-    def _solution(self, answer: Answer, mode: Mode) -> Solution:
+    def _solution(self, answer: Answer, numbers: Records, mode: Mode) -> Solution:
         if answer.status != ACCEPTED:
             reason = Reason.NO_MATCH if mode == "lost_in_space" else Reason.PREDICTION_LOST
             if answer.status == TOO_FEW:
                 reason = Reason.TOO_FEW_STARS
             return Solution.invalid(reason, mode=mode)
         rms, sigma, log_false, _, _, _ = answer.numbers.tolist()
-        return Solution(
+        unknowns = 4 if float(numbers["scale_tolerance"][0]) > 0.0 else 3
+        freedom = max(2 * answer.pairs.shape[1] - unknowns, 1)
+        solution = Solution(
             valid=True,
             reason=Reason.OK,
             quaternion_xyzw=answer.quaternion,
@@ -343,11 +348,13 @@ class Identifier(SingleCameraIdentifier):
             catalog_index=self._rows[answer.pairs[1]],
             hip=self._stars.hip[answer.pairs[1]],
             covariance=answer.covariance,
+            freedom=freedom + (PRIOR_FREEDOM if int(numbers["sigmas_known"][0]) else 0.0),
             rms_px=rms,
             sigma_px=sigma,
             probability_false=exp(log_false),
             mode=mode,
         )
+        return flagged(solution, self._largest_error_deg)
 
 
 def _scale_variation(camera: Camera) -> float:

@@ -162,7 +162,11 @@ class LsiIdentifier(VerifiedIdentifier):
         self._star_magnitude = self._magnitude_of_rank(share)
         self._verifier = (
             Identifier(
-                camera, self._catalog, limiting_magnitude=options.limiting_magnitude, cache=options.cache
+                camera,
+                self._catalog,
+                limiting_magnitude=options.limiting_magnitude,
+                largest_error_deg=options.largest_error_deg,
+                cache=options.cache,
             )
             if options.refinement
             else None

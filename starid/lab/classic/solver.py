@@ -39,6 +39,7 @@ from starid.identification.geometric.index_choice import pixels_per_radian
 from starid.identification.geometric.pattern_index import field_solid_angle, resolved_stars
 from starid.identification.geometric.pattern_stars import select_pattern_stars
 from starid.identification.geometric.verified import VerifiedIdentifier
+from starid.identification.options import UNLIMITED_DEG
 from starid.identification.single_camera import CheckedDetections
 from starid.identification.solution import Reason, Solution
 from starid.lab.classic.agreement import MIN_GROUP, largest_group
@@ -223,7 +224,9 @@ class ClassicIdentifier(VerifiedIdentifier):
     @cached_property
     def verifier(self) -> Identifier:
         """The geometric identifier that verifies answers and tracks."""
-        return Identifier(self._camera, self._catalog, cache=self.options.cache)
+        return Identifier(
+            self._camera, self._catalog, largest_error_deg=UNLIMITED_DEG, cache=self.options.cache
+        )
 
     def _guide_stars(self, per_field: float) -> GuideStars:
         """Choose the brightest stars, as the camera resolves them, with a mean number per field."""

@@ -28,6 +28,7 @@ from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
 from starid.identification.geometric.pattern_index import field_solid_angle
+from starid.identification.options import UNLIMITED_DEG
 from starid.identification.solution import Solution
 from starid.lab.classic.registry import CLASSICS, make_identifier
 from starid.lab.leaderboard import astrometry_net
@@ -226,7 +227,7 @@ def _own(name: str, camera: Camera) -> Solver:
     algorithm, _, solver = name.partition("-")
     if algorithm in ("lsi", "rsi") and camera.fov_deg < MIN_FEATURE_FIELD_DEG:
         raise UnsuitedError(f"no database for fields below {MIN_FEATURE_FIELD_DEG:g}°")
-    options: dict[str, Any] = {"solver": solver} if solver else {}
+    options: dict[str, Any] = {"largest_error_deg": UNLIMITED_DEG, **({"solver": solver} if solver else {})}
     identifier: Any = make_identifier(algorithm, camera, **options)
 
     def solve(scene: Scene) -> Reply:

@@ -84,6 +84,18 @@ def test_a_result_is_known_only_after_its_modelled_latency(bench):
     assert attitude["latency"] == pytest.approx((after - 0.05) * 1e3, abs=0.1)
 
 
+def test_an_image_processed_during_the_next_exposure_has_its_result_a_period_later(make_bench):
+    """Erlank (2013), table 6.2: images are processed, for 388 ms, while the next one is exposed; 0.94 to 1.24 s after mid-exposure."""
+    bench = make_bench(load_profile("cubestar")).start()
+    bench.command("set_mode", mode="lost_in_space")
+    after = 1.0 + 0.388 + 40 * 0.00005
+    bench.step(after - 0.001)
+    assert bench.read("precise_attitude")["reason"] == "no_frame"
+    bench.step(0.002)
+    assert bench.read("precise_attitude")["latency"] == pytest.approx((after - 0.15) * 1e3, abs=0.1)
+    assert 940.0 < bench.read("precise_attitude")["latency"] < 1241.0
+
+
 @pytest.mark.parametrize("rate", [0.5, 1.0, 5.0, 10.0])
 def test_frames_come_at_the_update_rate(bench, rate):
     bench.command("set_update_rate", rate=rate)

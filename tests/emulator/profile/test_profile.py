@@ -241,7 +241,7 @@ def test_all_errors_of_a_profile_are_listed_each_with_its_source_key_and_remedy(
             f"profile {path}: camera.widht: unknown key; did you mean width?",
             f"profile {path}: sensor.read_nois: unknown key; did you mean read_noise_e, dead_pixels?",
             f"profile {path}: sensor.bits: must be one of 8, 12, 16 (given: 9)",
-            f"profile {path}: identifier.foo: not an option of the algorithm geometric; known: blend_px, cache, fov_tolerance, limiting_magnitude",
+            f"profile {path}: identifier.foo: not an option of the algorithm geometric; known: blend_px, cache, fov_tolerance, largest_error_deg, limiting_magnitude",
             f"profile {path}: optical: {fault}",
             f"profile {path}: device.stuck: {fault}",
             f"profile {path}: health.t: must be a number (given: 'x')",

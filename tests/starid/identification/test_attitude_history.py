@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
-from starid.attitude import Attitude
+from starid.attitude import Attitude, propagate
 from starid.identification.attitude_history import AttitudeHistory
 
 
@@ -50,3 +51,33 @@ def test_an_interruption_or_a_longer_gap_ends_the_history():
     assert recent.rate() is not None
     recent.add(4.1, Attitude.identity(), 1.0)
     assert recent.rate() is None
+
+
+@pytest.mark.parametrize("window", [2, 3, 10])
+def test_the_error_of_a_prediction_is_as_large_as_stated(window):
+    """One second after attitudes half a second apart; of those within two seconds."""
+    sigma, rng = np.array([1e-4, 2e-4, 3e-4]), np.random.default_rng(1)
+    rate = np.array([0.01, -0.02, 0.03])
+    squares, stated = [], np.zeros((3, 3))
+    for _ in range(2000):
+        recent = AttitudeHistory(window)
+        for number in range(window):
+            truth = propagate(Attitude.identity(), rate, 0.5 * number)
+            recent.add(
+                0.5 * number, truth.rotated(sigma * rng.standard_normal(3)), 1.0, np.diag(sigma**2), 40.0
+            )
+        at = 0.5 * (window - 1) + 1.0
+        stated, _ = recent.uncertainty(at)
+        error = recent.predict(at, recent.rate()).error_to(propagate(Attitude.identity(), rate, at))
+        squares.append(error.rotation_vector_rad**2)
+    assert np.mean(squares, axis=0) / np.diag(stated) == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 2000))
+
+
+def test_two_attitudes_have_fewer_degrees_of_freedom_than_their_sum():
+    """At twice the time, ``(2² + 1)²/(2⁴/ν + 1/ν)`` for variances of 4 and 1: 25/17 ν."""
+    recent = AttitudeHistory(2)
+    for number in range(2):
+        recent.add(number, Attitude.identity(), 1.0, np.eye(3), 34.0)
+    covariance, freedom = recent.uncertainty(2.0)
+    assert covariance == pytest.approx(5.0 * np.eye(3))
+    assert freedom == pytest.approx(50.0)

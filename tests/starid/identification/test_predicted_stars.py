@@ -6,12 +6,19 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.ndimage import gaussian_filter, maximum_filter
 
 from starid.attitude import Attitude, random_attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.catalog import StarCatalog, load_catalog
-from starid.identification.predicted_stars import expected_places, noise_peaks, solve_with_prediction
+from starid.identification.predicted_stars import (
+    Prediction,
+    expected_places,
+    noise_peaks,
+    solve_with_prediction,
+    unnoticed_share,
+)
 from starid.identification.solution import Solution
 from starid.imaging.detection import Detections
 
@@ -20,7 +27,7 @@ pytestmark = pytest.mark.long
 SIGMA_RAD = 60.0 / 206265.0
 PRIOR = np.diag([SIGMA_RAD**2, SIGMA_RAD**2, 4.0 * SIGMA_RAD**2])
 ZERO_POINT, SNR, POSITION_PX = 14.0, 8.0, 0.15
-MAX_ERROR_RAD = math.radians(0.3)
+MAX_ERROR_DEG, FREEDOM = 0.3, 60.0
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +53,7 @@ def image(truth: Attitude, stars: StarCatalog, count: int | None, rng: np.random
 
 def solve(found: Detections, predicted: Attitude, stars: StarCatalog) -> Solution:
     return solve_with_prediction(
-        DEFAULT_CAMERA, stars, found, predicted, PRIOR, ZERO_POINT, 1e-5, MAX_ERROR_RAD
+        DEFAULT_CAMERA, stars, found, Prediction(predicted, PRIOR, FREEDOM), ZERO_POINT, 1e-5, MAX_ERROR_DEG
     )
 
 
@@ -103,3 +110,63 @@ def test_a_star_far_from_its_place_or_of_another_brightness_is_left_out(bright: 
     magnitude[3] += 2.5
     solution = solve(detections(xy, magnitude), truth, bright)
     assert sorted(solution.detection_index.tolist()) == [0, 2, 4]
+
+
+LIMIT_RAD = math.radians(0.1)
+CONTRADICTION = stats.chi2.ppf(0.999, 3)
+
+
+def simulated_share(stars: np.ndarray, prior: np.ndarray, angle: float, rng: np.random.Generator) -> float:
+    """Share of errors by an angle about random axes that pass the test, and are too large in the combined attitude."""
+    count = 400_000
+    axes = rng.standard_normal((count, 3))
+    error = angle * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    error += rng.multivariate_normal(np.zeros(3), prior, count)
+    of_stars = rng.multivariate_normal(np.zeros(3), stars, count)
+    off = error - of_stars
+    passes = np.einsum("ni,ij,nj->n", off, np.linalg.inv(prior + stars), off) <= CONTRADICTION
+    answer = of_stars + off @ (stars @ np.linalg.inv(prior + stars)).T
+    large = np.maximum(np.hypot(answer[:, 0], answer[:, 1]), np.abs(answer[:, 2])) > LIMIT_RAD
+    return float(np.mean(passes & large))
+
+
+@pytest.mark.parametrize(
+    ("stars_arcsec", "turned", "least"),
+    [((30.0, 30.0, 300.0), 0.0, 0.01), ((40.0, 20.0, 600.0), 0.5, 0.01), ((25.0, 25.0, 100.0), 0.2, 0.0)],
+    ids=["few stars", "two stars off the boresight", "stars that show the roll"],
+)
+def test_wrong_predictions_go_unnoticed_no_more_often_than_bounded(
+    stars_arcsec: tuple[float, ...], turned: float, least: float
+) -> None:
+    prior = np.diag(np.square(np.array([30.0, 30.0, 75.0]) / 206265.0))
+    turn = Attitude.identity().rotated((turned, 0.0, 0.0)).matrix
+    stars = turn @ np.diag(np.square(np.array(stars_arcsec) / 206265.0)) @ turn.T
+    bound = unnoticed_share(np.linalg.inv(stars), prior, LIMIT_RAD)
+    rng = np.random.default_rng(7)
+    worst = max(
+        simulated_share(stars, prior, step * LIMIT_RAD, rng) for step in (0.6, 0.8, 1.0, 1.2, 1.4, 1.7, 2.0)
+    )
+    assert worst <= bound + 4.0 * math.sqrt(max(worst, 1e-5) / 400_000)
+    assert bound <= 3.0 * worst + 1e-4
+    assert worst >= least
+
+
+def test_an_attitude_that_rests_on_the_prediction_is_invalid_where_many_predictions_are_wrong(
+    bright: StarCatalog,
+) -> None:
+    """Three stars close together do not show a roll about them."""
+    valid = {1e-3: 0, 1.0: 0}
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        truth = random_attitude(rng)
+        rows, xy = expected_places(DEFAULT_CAMERA, bright, truth)
+        close = np.argsort(np.hypot(*(xy - xy[0]).T))[:3]
+        found = detections(xy[close] + POSITION_PX * rng.standard_normal((3, 2)), bright.v[rows[close]])
+        for share in valid:
+            solution = solve_with_prediction(
+                DEFAULT_CAMERA, bright, found, Prediction(truth, PRIOR, FREEDOM), ZERO_POINT, 1e-5, 0.15,
+                wrong_predictions=share,
+            )  # fmt: skip
+            valid[share] += solution.valid
+    assert valid[1e-3] > 40
+    assert valid[1.0] < 20

@@ -28,7 +28,7 @@ def test_stars_in_windows_are_those_of_the_whole_image() -> None:
     places = np.array([[50.2, 60.7], [201.4, 333.1], [377.8, 18.2], [120.5, 121.5], [128.5, 118.5]])
     image = sky(places, 600.0)
     whole = detect(image, SETTINGS)
-    found, rivals = detect_near(image, places[:4] + 1.5, 6.0, SETTINGS)
+    found, rivals, _ = detect_near(image, places[:4] + 1.5, 6.0, SETTINGS)
     assert len(found) == 4
     for x, y in found.xy_px:
         near = np.hypot(*(whole.xy_px - (x, y)).T)
@@ -39,15 +39,19 @@ def test_stars_in_windows_are_those_of_the_whole_image() -> None:
 
 def test_a_star_near_two_places_is_found_once() -> None:
     image = sky(np.array([[200.0, 200.0]]), 600.0)
-    found, _ = detect_near(image, np.array([[198.0, 200.0], [203.0, 200.0]]), 6.0, SETTINGS)
+    found = detect_near(image, np.array([[198.0, 200.0], [203.0, 200.0]]), 6.0, SETTINGS).found
     assert len(found) == 1
     assert found.xy_px[0] == pytest.approx([200.0, 200.0], abs=0.1)
 
 
 def test_nothing_is_found_away_from_the_places() -> None:
     image = sky(np.array([[200.0, 200.0], [100.0, 100.0]]), 600.0)
-    found, _ = detect_near(image, np.array([[210.0, 200.0], [300.0, 100.0], [1.0, 1.0]]), 6.0, SETTINGS)
+    image[:, 260:] = 0
+    found, _, searched = detect_near(
+        image, np.array([[210.0, 200.0], [300.0, 100.0], [1.0, 1.0]]), 6.0, SETTINGS
+    )
     assert len(found) == 0
+    assert searched.tolist() == [True, False, False], "the image is constant, or ends"
 
 
 ONE = 1.0 / (np.pi * (MAX_RADIUS_PX**2 - 6.0**2))
@@ -63,8 +67,8 @@ def test_false_peaks_at_the_edge_of_a_dark_body_are_counted_apart() -> None:
     for seed in range(10):
         image = sky(np.zeros((0, 2)), 0.0, seed)
         image[:, 203:] = 0
-        alone, alone_rivals = detect_near(image, edge - (120.0, 0.0), 6.0, faint)
-        both, rivals = detect_near(image, np.concatenate([edge - (120.0, 0.0), edge]), 6.0, faint)
+        alone, alone_rivals, _ = detect_near(image, edge - (120.0, 0.0), 6.0, faint)
+        both, rivals, _ = detect_near(image, np.concatenate([edge - (120.0, 0.0), edge]), 6.0, faint)
         away = both.xy_px[:, 0] < 140.0
         at_edge += np.count_nonzero(~away)
         counted.extend(rivals[~away] / ONE)

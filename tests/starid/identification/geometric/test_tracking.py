@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from starid.attitude import Attitude, propagate, random_attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.errors import StaridError
-from starid.identification.geometric.identifier import Effort, Identifier
+from starid.identification.geometric.identifier import Effort
 from starid.identification.solution import Reason, Solution
 from starid.identification.tracker import Tracker
 from starid.identification.undetected import missing_stars
@@ -69,7 +69,10 @@ def test_verification_requires_more_than_tracking() -> None:
     few = xy[:4], flux[:4], AT
     loose = identifier().verify(*few, window_px=12.0).probability_false
     between = math.sqrt(loose * identifier().track(*few, window_px=12.0).probability_false)
-    strict = Identifier(effort=Effort(max_false_probability=between, max_false_probability_tracking=between))
+    strict = identifier().with_camera(
+        DEFAULT_CAMERA,
+        effort=Effort(max_false_probability=between, max_false_probability_tracking=between),
+    )
     assert strict.track(*few, window_px=12.0).valid
     assert not strict.verify(*few, window_px=12.0).valid
 
@@ -200,7 +203,7 @@ def test_the_attitude_weights_errors_along_and_across_a_trail_by_their_covarianc
     best = least_squares(residuals, np.zeros(3), x_scale=1e-6, xtol=1e-15, ftol=1e-15, gtol=1e-15)
     assert len(used) > 0.9 * count
     assert solution.attitude.error_to(AT.rotated(best.x)).total_arcsec < 0.05
-    given = Identifier.verify(identifier(), measured, flux, AT, covariance, window_px=12.0)
+    given = identifier().verify(measured, flux, AT, covariance, window_px=12.0)
     assert given.quaternion_xyzw == pytest.approx(solution.quaternion_xyzw, abs=1e-12)
 
 
