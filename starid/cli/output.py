@@ -49,6 +49,9 @@ _HANDLER: Final = "starhil-plain"
 PROGRESS_S: Final = 5.0
 """Time after which the progress of compiling is reported, and between reports, seconds."""
 
+COMPILED_S: Final = 120.0
+"""Time without a new kernel after which the cache is no longer searched for more, as that would disturb a benchmark, seconds."""
+
 
 @contextmanager
 def compiling_reported(modules: Iterable[str], *, start: bool = False) -> Iterator[None]:
@@ -65,10 +68,11 @@ def compiling_reported(modules: Iterable[str], *, start: bool = False) -> Iterat
         from starid.kernels.compile_progress import CompileProgress
         from starid.storage import cache
 
-        progress, written, compiled = None, 0, ""
+        progress, written, compiled, grown_s = None, 0, "", begin_s
         while True:
             before, written = written, cache.kernels_written_since(begin_unix_s)
             if written > before:
+                grown_s = time.monotonic()
                 progress = progress or CompileProgress(modules)
                 at_most = len(progress.kernels)  # some options need fewer
                 compiled = (
@@ -77,7 +81,8 @@ def compiling_reported(modules: Iterable[str], *, start: bool = False) -> Iterat
             if start or written > before:
                 what = "starting" if start else "compiling"
                 print(f"{what}: {time.monotonic() - begin_s:.0f} s{compiled}", file=sys.stderr, flush=True)
-            if ended.wait(PROGRESS_S):
+            done = not start and time.monotonic() - grown_s > COMPILED_S
+            if done or ended.wait(PROGRESS_S):
                 return
 
     threading.Thread(target=report, daemon=True).start()

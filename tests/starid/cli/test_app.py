@@ -22,7 +22,7 @@ from starid.catalog import load_catalog
 from starid.cli import app, identify, output
 from starid.kernels.compile_progress import CompileProgress
 from tests.emulator.cli.command_line import run_command_line
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.long
 
@@ -174,3 +174,14 @@ def test_compiling_is_reported_while_the_number_of_kernels_grows(monkeypatch, ca
     expected = ["", done[0], done[0], done[1]] if start else done
     lines = [rf"{'starting' if start else 'compiling'}: \d+ s{line}\n" for line in expected]
     assert re.fullmatch("".join(lines), capsys.readouterr().err)
+
+
+def test_kernels_are_no_longer_looked_for_when_none_has_been_compiled_for_long(monkeypatch):
+    """To look for them took 10 ms of a benchmark every 5 s."""
+    looked = []
+    monkeypatch.setattr("starid.storage.cache.kernels_written_since", lambda _begin_s: looked.append(1) or 0)
+    monkeypatch.setattr(output, "PROGRESS_S", 0.001)
+    monkeypatch.setattr(output, "COMPILED_S", 0.05)
+    before = threading.active_count()
+    with output.compiling_reported(["starid.photograph.solver"]):
+        wait_until(lambda: looked and threading.active_count() == before)
