@@ -139,6 +139,23 @@ def test_every_command_has_the_options_that_the_pages_show(whole, least):
     assert len(named) > least
 
 
+def test_the_readme_types_no_file_that_its_reader_lacks():
+    """What a command reads, an earlier one has written."""
+    made: set[str] = set()
+    lacking, read = [], 0
+    for call in (call for block in typed("README.md") for line in block.lines for call in calls(line)):
+        for option, word in pairwise(call):
+            if not re.search(r"\.(?:png|jpe?g|tiff?|fits|toml|csv|mcap)$", word):
+                continue
+            if option in ("-o", "--html", "--junit", "--record"):
+                made.add(word)
+            else:
+                read += 1
+                lacking += [call] if word not in made else []
+    assert lacking == []
+    assert read >= 3
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """Work in a folder with the files that the pages name."""

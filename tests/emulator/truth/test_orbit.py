@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydantic import TypeAdapter, ValidationError
+from sgp4.api import accelerated
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.config import OrbitConfig
@@ -170,6 +171,10 @@ def test_a_tle_that_leaves_the_earth_has_no_position():
     """A drag term whose columns are shifted had the satellite beyond the stars the next day."""
     first = "1 25544U 98067A   24001.50000000  .00016717     10270-3 0  9009     "
     second = "2 25544  51.6400 208.9163 0006317  69.9862  25.2906 15.49560532    1"
+    if not accelerated:  # this sgp4 is strict about columns, and the compiled one is not
+        with pytest.raises(EmulatorError, match="TLE format error"):
+            TleOrbit(summed(first), summed(second))
+        return
     orbit = TleOrbit(summed(first), summed(second))
     start = unix_time("2024-01-01T12:00:00")
     assert length(orbit.state(start).position_m) < 7e6

@@ -621,9 +621,8 @@ def test_a_life_of_a_unit_without_telecommands_reads_it(tmp_path):
     assert "nmt" not in {step["do"] for step in life.steps}
     outcome = run_once(life)
     assert outcome.violation == ""
-    assert (
-        outcome.readings > 10
-    )  # the process of the images restarts in real time, and is not ready for some of the requests
+    # the process of the images restarts in real time, and is not ready for some of the requests
+    assert outcome.readings > 10
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.name)

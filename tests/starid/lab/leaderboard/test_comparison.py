@@ -79,7 +79,7 @@ class Recorder:
 
 def test_a_row_does_not_depend_on_the_rows_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
     recorder = Recorder()
-    monkeypatch.setattr(peers, "make_identifier", lambda *_: recorder)
+    monkeypatch.setattr(peers, "make_identifier", lambda *_, **__: recorder)
     run(2, 5, own=["lsi"], rows=["0.5", "1"])
     # one scene when it is made, then a warm-up and two scenes a row
     assert recorder.notes == [0, *[0, 1, 2] * 2]
