@@ -55,6 +55,8 @@ POINTING: Final = from_radec_roll(90.0, -30.0, 45.0)
 """Attitude of an emulator that a run starts: in any naming of the axes, a conjugated quaternion is at least 19 deg off."""
 
 
+DEVICE_TYPE: Final = 0x1000
+"""Index of the one object that CiA 301 requires of every node."""
 LONGEST_LINE: Final = 1000
 """Longest line of an EDS, of which CiA 306 allows 255 characters: Python's reader takes a time that grows with its square."""
 
@@ -310,7 +312,10 @@ def _canopen_probe(request: ConformanceRequest, unit: Unit, can: str, stack: Exi
         try:
             dictionary = import_od(str(path), node)
         except (canopen.ObjectDictionaryError, configparser.Error, *WRONG_VALUES) as error:
-            raise BenchError(f"{request.eds}: not a valid EDS: {error}") from None
+            why = str(error).replace(str(path), str(request.eds))
+            raise BenchError(f"{request.eds}: not a valid EDS: {why}") from None
+    if DEVICE_TYPE not in dictionary:
+        raise BenchError(f"{request.eds}: not a valid EDS: lacks object 1000h, which every node has")
     bus = stack.enter_context(LivePort(open_can(can), request.speed))
     return CanopenProbe(bus, node, dictionary, text, entries(unit, unit.canopen))
 
