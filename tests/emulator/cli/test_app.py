@@ -172,7 +172,7 @@ def test_the_version_is_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.
     with pytest.raises(SystemExit) as caught:
         app.main()
     assert caught.value.code == 0
-    assert re.fullmatch(r"starhil \d+\.\d+\.\d+\n", capsys.readouterr().out)
+    assert re.fullmatch(r"starhil \d+\.\d+\.\d+(\.dev\d+)?\n", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(
