@@ -24,6 +24,7 @@ import numpy.typing as npt
 import starid
 from starhil.emulator.benchmarks.hard_sky import FASTEST_DEG_S, HARD_SENSOR, hard_sky
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Renderer
 from starid.arithmetic.arrays import Array
@@ -247,6 +248,16 @@ def open_store(folder: Path, plan: Mapping[str, Any]) -> ResultStore:
     StaridError if it holds another plan, or cannot be used.
     """
     return ResultStore(folder, {**plan, "made_by": made_by()}, "campaign")
+
+
+def store_with_device(plan: Any, folder: Path | None) -> ResultStore | None:
+    """Return the store of a plan with `profile` and `overrides`: what is in the profile, which may be a file, belongs to the plan."""
+    profile = load_profile(plan.profile, plan.overrides)
+    return (
+        None
+        if folder is None
+        else open_store(folder, {**asdict(plan), "device": profile.model_dump(mode="json")})
+    )
 
 
 def run_parts(

@@ -10,13 +10,13 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, open_store, run_parts
+from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, run_parts, store_with_device
 from starhil.emulator.benchmarks.hard_sky import direction_around
 from starhil.emulator.device.device import adopt_camera, profile_defaults
 from starhil.emulator.device.navigation import observer_velocity
@@ -355,9 +355,7 @@ def run_ecss(
 
     Yields condition name, chunk number and results of each part as it finishes.
     """
-    profile = load_profile(plan.profile, plan.overrides)
-    described = {**asdict(plan), "device": profile.model_dump(mode="json")}
-    store = None if folder is None else open_store(folder, described)
+    store = store_with_device(plan, folder)
     named = {f"{condition.name}-{chunk:04d}": (condition, chunk) for condition, chunk in parts(plan, only)}
     calls = {name: (run_part, plan, *part) for name, part in named.items()}
     for name, results in run_parts(calls, store, jobs):

@@ -13,17 +13,16 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, open_store, run_parts
+from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, run_parts, store_with_device
 from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
 from starhil.emulator.device.navigation import observer_velocity
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.pipeline.messages import FrameRequest, FrameResult
 from starhil.emulator.sensor.sky.radiation import default_rates, particle_rate
@@ -179,9 +178,7 @@ def run_orbit(plan: OrbitPlan, *, folder: Path | None = None, jobs: int = 1) -> 
         raise EmulatorError(
             f"campaign: pointing must be one of {', '.join(POINTINGS)}, not {plan.pointing!r}"
         )
-    profile = load_profile(plan.profile, plan.overrides)
-    described = {**asdict(plan), "device": profile.model_dump(mode="json")}
-    store = None if folder is None else open_store(folder, described)
+    store = store_with_device(plan, folder)
     calls = {f"chunk-{chunk:04d}": (run_chunk, plan, chunk) for chunk in range(plan.chunks)}
     for _, results in run_parts(calls, store, jobs):
         yield results

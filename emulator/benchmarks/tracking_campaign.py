@@ -10,17 +10,16 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, open_store, run_parts
+from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, run_parts, store_with_device
 from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
 from starhil.emulator.device.parameters import exposure_period_s
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.pipeline.messages import FrameRequest, FrameResult
 from starhil.emulator.truth.source import TruthState
 from starid.arithmetic.arrays import Array
@@ -168,9 +167,7 @@ def run_tracking(plan: TrackingPlan, *, folder: Path | None = None, jobs: int = 
     """Run a campaign of tracking, as `starhil.emulator.benchmarks.campaign.run_campaign`."""
     if not 0.0 <= plan.blocked <= 1.0:
         raise EmulatorError(f"campaign: blocked must be a share from 0 to 1, not {plan.blocked}")
-    profile = load_profile(plan.profile, plan.overrides)
-    described = {**asdict(plan), "device": profile.model_dump(mode="json")}
-    store = None if folder is None else open_store(folder, described)
+    store = store_with_device(plan, folder)
     calls = {f"chunk-{chunk:04d}": (run_chunk, plan, chunk) for chunk in range(plan.chunks)}
     for _, results in run_parts(calls, store, jobs):
         yield results
