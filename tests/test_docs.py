@@ -233,7 +233,7 @@ def columns_of_files_and_caches(title: str) -> list[str]:
 
 def case_counts(*words: str) -> dict[str, int]:
     """Return how many cases there are on each link; those that only list values without a rule do not count."""
-    _, listed, _ = run_command_line("conformance", "--list", *words)
+    _, listed, _ = run_command_line("conformance", "--list", "--start", *words)
     areas = [line.split(".")[:2] for line in listed.splitlines()]
     return Counter(link for link, area in areas if area != "unjudged")
 

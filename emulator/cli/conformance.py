@@ -55,9 +55,14 @@ class CaseOptions:
             "running must use the same speed (run --clock scaled:…).",
         ),
     ] = 1.0
-    safe_only: Annotated[
-        bool, typer.Option("--safe-only", help="Run only cases that change nothing; for a unit in use.")
-    ] = False
+    intrusive: Annotated[
+        bool | None,
+        typer.Option(
+            "--intrusive/--safe-only",
+            help="Also run cases that change modes, parameters and files of the device, or only those that change nothing.",
+            show_default="--safe-only; with --start, --intrusive",
+        ),
+    ] = None
     baud: Annotated[
         int | None,
         typer.Option(
@@ -108,7 +113,7 @@ class CaseOptions:
             host_address=bench.host_address,
             device_address=bench.device_address,
             patterns=patterns,
-            safe_only=self.safe_only,
+            intrusive=self.intrusive,
             speed=self.speed,
             times=ProbeTimes(answer_s=self.time_out),
             view=bench.view,
@@ -124,7 +129,9 @@ def command(
     *,
     bench: BenchOptions,
     cases: CaseOptions,
-    list_only: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
+    list_only: Annotated[
+        bool, typer.Option("--list", help="List the cases that would be run, and exit.")
+    ] = False,
     html: Annotated[
         Path | None,
         typer.Option(help=output_help("Write an HTML report with the sent, expected and received data.")),
@@ -135,6 +142,8 @@ def command(
     as_json: AsJson = False,
 ) -> None:
     """Test a star sensor, emulated or real, over its bus.
+
+    Without --start, only cases that change nothing are run, unless --intrusive is given.
 
     The exit status is 0 if no case failed, 1 if some failed, and 2 for invalid input. Settings changed by
     cases are restored at the end. After SIGINT, SIGTERM or SIGHUP they are restored too, the remaining cases
@@ -147,22 +156,26 @@ def command(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     from starhil.hil_tests.conformance import report
-    from starhil.hil_tests.conformance.conformance_run import all_cases, run_conformance
-    from starhil.hil_tests.conformance.runner import Outcome
-    from starhil.hil_tests.reports import prepare_report
+    from starhil.hil_tests.conformance.conformance_run import requested_cases, run_conformance
+    from starhil.hil_tests.conformance.runner import Outcome, left_out_text
+    from starhil.hil_tests.reports import NOT_RUN, prepare_report
     from starhil.hil_tests.rig.interruption import interruptible
 
     request, junit = cases.request(bench, tuple(patterns or ()), list_only=list_only), bench.junit
     console = Console(highlight=False, quiet=as_json)
+    chosen, left_out = requested_cases(request)
     if list_only:
-        for item in all_cases(request):
+        for item in chosen:
             kind = "intrusive" if item.intrusive else "safe"
             print(f"{item.id}\t{kind}\t{item.title}\t{item.clause}")
+    if left_out:
+        notice = Console(stderr=True, highlight=False) if list_only else console
+        notice.print(left_out_text(left_out, [*chosen, *left_out]), soft_wrap=True)
+    if list_only:
         return
     for path in (junit, html):
         if path is not None:
             prepare_report(path)
-    total = len(all_cases(request))
     with (
         interruptible(),
         Progress(
@@ -170,10 +183,10 @@ def command(
             console=console, transient=True, disable=not console.is_terminal or as_json,
         ) as progress,
     ):  # fmt: skip
-        bar = progress.add_task("starting" if request.start else "", total=total)
+        bar = progress.add_task("starting" if request.start else "", total=len(chosen))
 
         def show(outcome: Outcome) -> None:
-            progress.update(bar, advance=1, description=outcome.id)
+            progress.update(bar, advance=outcome.status != NOT_RUN, description=outcome.id)
             report.print_outcome(console, outcome, verbose=verbose)
 
         result = run_conformance(request, show)

@@ -22,6 +22,7 @@ from starhil.hil_tests.conformance.runner import (
     Outcome,
     case_of_run,
     identity_of,
+    left_out_text,
     not_run,
     run_cases,
     select_cases,
@@ -55,6 +56,10 @@ POINTING: Final = from_radec_roll(90.0, -30.0, 45.0)
 """Attitude of an emulator that a run starts: in any naming of the axes, a conjugated quaternion is at least 19 deg off."""
 
 
+LEFT_OUT: Final = "it changes the device; --intrusive runs it"
+"""Reason why a case was not run."""
+
+
 DEVICE_TYPE: Final = 0x1000
 """Index of the one object that CiA 301 requires of every node."""
 LONGEST_LINE: Final = 1000
@@ -84,17 +89,23 @@ class ConformanceRequest:
     host_address: int = 1
     device_address: int = 4
     patterns: tuple[str, ...] = ()
-    safe_only: bool = False
+    intrusive: bool | None = None
+    """Whether cases that change the device are run; by default only with `start`."""
     speed: float = 1.0
     times: ProbeTimes = field(default_factory=ProbeTimes)
     view: str | None = None
     """Address of a console that shows the outcomes; `auto` with `start`: the started emulator's console."""
 
+    @property
+    def safe_only(self) -> bool:
+        """Whether only cases that change nothing are run."""
+        return not (self.start if self.intrusive is None else self.intrusive)
 
-def all_cases(request: ConformanceRequest) -> list[Case[Any]]:
-    """Return the cases of all requested links, selected by pattern and safety.
 
-    Raises BenchError: no link is given, the unit does not have the dialect, or a pattern matches no case.
+def requested_cases(request: ConformanceRequest) -> tuple[list[Case[Any]], list[Case[Any]]]:
+    """Return the cases of all requested links, selected by pattern: those to run, and those left out because they change the device.
+
+    Raises BenchError: no link is given, the unit does not have the dialect, or a pattern matches no case or none to run.
     """
     unit = read_unit(request.unit or DEFAULT_UNIT)
     cases: list[Case[Any]] = []
@@ -155,9 +166,11 @@ def run_conformance(
     Raises BenchError, ProtocolError: a port, a bus or the emulator is not available.
     """
     unit = read_unit(request.unit or DEFAULT_UNIT)
-    cases = all_cases(request)
+    cases, left_out = requested_cases(request)
     outcomes: list[Outcome] = []
     facts = _facts(request, unit)
+    if left_out:
+        facts["left out"] = left_out_text(left_out, [*cases, *left_out])
     complete = False
 
     listeners = [outcomes.append, on_outcome]
@@ -179,8 +192,9 @@ def run_conformance(
             if request.view is not None:
                 where = " ".join(port for link in BUSES if (port := ports.get(link)))
                 address = console_address(request.view, emulator)
+                planned = len(cases) + len(left_out)
                 feed = stack.enter_context(
-                    RunFeed(address, kind="conformance", title="Conformance", unit=where, planned=len(cases))
+                    RunFeed(address, kind="conformance", title="Conformance", unit=where, planned=planned)
                 )
                 listeners.append(partial(_send_to_console, feed))
             links = {item.id.partition(".")[0] for item in cases}
@@ -189,6 +203,8 @@ def run_conformance(
                 facts[f"device on {probe.link}"] = identity_of(probe)
                 mine = [item for item in cases if item.id.startswith(f"{probe.link}.")]
                 run_cases(probe, mine, record, port=port)
+            for item in left_out:
+                record(not_run(item, LEFT_OUT))
             complete = True
     except EmulatorProcessError as error:
         if not complete:
@@ -199,9 +215,9 @@ def run_conformance(
         record(Outcome.of(end, CaseFailed("exit with status 0 on request", str(error))))
     except Interrupted as interruption:
         done = {outcome.id for outcome in outcomes}
-        for item in cases:
+        for item in (*cases, *left_out):
             if item.id not in done:
-                record(not_run(item, interruption.reason))
+                record(not_run(item, LEFT_OUT if item in left_out else interruption.reason))
         return ConformanceResult(outcomes, facts, interruption)
     return ConformanceResult(outcomes, facts)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fnmatch
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Sized
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -65,8 +65,10 @@ class Outcome:
 
 def select_cases(
     cases: Iterable[Case[Any]], patterns: Sequence[str] = (), *, safe_only: bool = False
-) -> list[Case[Any]]:
-    """Return the cases whose ID matches a pattern with `*` and `?`, or begins with a plain name.
+) -> tuple[list[Case[Any]], list[Case[Any]]]:
+    """Return the cases whose ID matches a pattern with `*` and `?`, or begins with a plain name: those to run, and those left out.
+
+    Cases that change the device are left out if `safe_only`.
 
     Raises BenchError: a pattern matches no case, or none of its cases is left.
     """
@@ -77,14 +79,17 @@ def select_cases(
         if not matches:
             areas = ", ".join(sorted({item.area for item in items}))
             raise BenchError(f"no conformance case matches '{pattern}'; areas: {areas}")
-        safe = [item for item in matches if not item.intrusive]
-        if safe_only and not safe:
-            raise BenchError(
-                f"no conformance case that matches '{pattern}' is left: --safe-only leaves out all {len(matches)}, which change "
-                "the device"
-            )
-        selected.update(item.id for item in (safe if safe_only else matches))
-    return [item for item in items if item.id in selected]
+        if safe_only and all(item.intrusive for item in matches):
+            raise BenchError(f"no case that matches '{pattern}' is run: {left_out_text(matches, matches)}")
+        selected.update(item.id for item in matches)
+    chosen = [item for item in items if item.id in selected]
+    left_out = [item for item in chosen if safe_only and item.intrusive]
+    return [item for item in chosen if not (safe_only and item.intrusive)], left_out
+
+
+def left_out_text(left_out: Sized, chosen: Sized) -> str:
+    """Return how many of the chosen cases are left out, why, and how to run them."""
+    return f"{len(left_out)} of {len(chosen)} cases are left out, because they change the device; --intrusive runs them"
 
 
 def _matches(case_id: str, pattern: str) -> bool:

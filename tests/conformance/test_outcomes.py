@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped
-from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, all_cases
+from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, requested_cases
 from starhil.hil_tests.conformance.report import print_outcome, print_summary
 from starhil.hil_tests.conformance.runner import Outcome, not_run, run_case, run_cases, select_cases
 from starhil.hil_tests.errors import BenchError
@@ -33,23 +33,25 @@ CASES = [
 
 
 @pytest.mark.parametrize(
-    ("patterns", "safe_only", "chosen"),
+    ("patterns", "safe_only", "chosen", "left_out"),
     [
-        ([], False, [0, 1, 2, 3]),
-        ([], True, [0, 1, 3]),
-        (["serial.framing"], False, [0, 1]),
-        (["*.type", "serial.framing.end"], False, [1, 3]),
+        ([], False, [0, 1, 2, 3], []),
+        ([], True, [0, 1, 3], [2]),
+        (["serial.framing"], False, [0, 1], []),
+        (["serial.framing"], True, [0, 1], []),
+        (["*.type", "serial.framing.end"], False, [1, 3], []),
     ],
 )
-def test_cases_are_chosen_by_names_and_patterns(patterns, safe_only, chosen):
-    assert select_cases(CASES, patterns, safe_only=safe_only) == [CASES[number] for number in chosen]
+def test_cases_are_chosen_by_names_and_patterns(patterns, safe_only, chosen, left_out):
+    selected = select_cases(CASES, patterns, safe_only=safe_only)
+    assert selected == ([CASES[number] for number in chosen], [CASES[number] for number in left_out])
 
 
 @pytest.mark.parametrize("others", [[], ["serial.framing"], ["can.id"]])
 def test_a_pattern_of_which_safe_only_leaves_nothing_is_an_error_also_beside_another(others):
     with pytest.raises(
         BenchError,
-        match=r"no conformance case that matches 'serial.m\*' is left: --safe-only leaves out all 1, which change",
+        match=r"no case that matches 'serial.m\*' is run: 1 of 1 cases are left out, .* --intrusive runs them",
     ):
         select_cases(CASES, [*others, "serial.m*"], safe_only=True)
 
@@ -71,7 +73,26 @@ def test_a_pattern_without_a_case_is_an_error_that_lists_the_areas():
     ],
 )
 def test_the_cases_are_those_of_the_links_that_are_given(request_, links):
-    assert {item.id.partition(".")[0] for item in all_cases(ConformanceRequest(**request_))} == links
+    chosen, left_out = requested_cases(ConformanceRequest(**request_))
+    assert {item.id.partition(".")[0] for item in (*chosen, *left_out)} == links
+
+
+@pytest.mark.parametrize(
+    ("request_", "intrusive"),
+    [
+        ({}, False),
+        ({"start": True}, True),
+        ({"intrusive": True}, True),
+        ({"start": True, "intrusive": False}, False),
+    ],
+)
+def test_cases_that_change_a_device_need_the_wish_of_the_user_unless_it_was_started_for_the_run(
+    request_, intrusive
+):
+    chosen, left_out = requested_cases(ConformanceRequest(unit="sagitta", serial="/dev/x", **request_))
+    assert any(item.intrusive for item in chosen) == intrusive
+    assert bool(left_out) != intrusive
+    assert all(item.intrusive for item in left_out)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +105,7 @@ def test_the_cases_are_those_of_the_links_that_are_given(request_, links):
 )
 def test_a_request_without_cases_is_rejected(request_, message):
     with pytest.raises(BenchError, match=message):
-        all_cases(ConformanceRequest(**request_))
+        requested_cases(ConformanceRequest(**request_))
 
 
 class Probe:

@@ -103,7 +103,13 @@ def test_a_port_where_nothing_answers_ends_the_conformance_run_with_its_reports(
     assert f"nothing answers on {port}" in outcome.output
     suite = ET.parse(junit).getroot()
     assert (suite.get("failures"), int(suite.get("skipped"))) == ("1", int(suite.get("tests")) - 1)
-    assert f"not run: nothing answers on {port}" in html.read_text(encoding="utf-8")
+    page = html.read_text(encoding="utf-8")
+    assert f"not run: nothing answers on {port}" in page
+    left_out = page.count("not run: it changes the device; --intrusive runs it")
+    assert left_out > 300
+    notice = f"{left_out} of {int(suite.get('tests')) - 1} cases are left out, because they change the device"
+    assert outcome.output.startswith(f"{notice}; --intrusive runs them\n")
+    assert f"<tr><th>left out</th><td>{notice}" in page
 
 
 @pytest.mark.parametrize(
