@@ -94,7 +94,8 @@ def run_session(request: SessionRequest) -> SessionResult:
     console = Console(highlight=False, quiet=request.quiet)
     console.print(Text(escape_controls(script.title), style="bold"))
     if not request.start and request.control is None and _asks_for_an_emulator(script):
-        hint = f"for an emulator that was started by: {start_command(script, folder)}"
+        hint = "for an emulator as --start makes it, or this command, which --control ADDRESS checks: "
+        hint += start_command(script, folder)
         console.print(Text(escape_controls(hint), style="dim"), soft_wrap=True)
     show: Callable[[StepResult], None] = partial(_print_result, console)
     result: SessionResult | None = None
@@ -144,24 +145,29 @@ def start_command(script: Script, folder: Path) -> str:
 
 
 def _check_emulator(path: Path, script: Script, rig: Rig, folder: Path) -> None:
-    """Raise BenchError if the emulator that runs is not the one that a script is for: its profile, its clock, where it looks."""
+    """Raise BenchError if the emulator that runs is not the one that a script is for: profile, settings, where it looks."""
     status, emulator = rig.control("status", {}), script.emulator
     problems = []
     if status["clock"] == "stepped":
         problems.append("its clock is stepped, on which a session waits for ever")
     if emulator.profile and status["profile"] != Path(emulator.profile).stem:
         problems.append(f"its profile is {status['profile']}, not {Path(emulator.profile).stem}")
+    present = {"run.algorithm": "algorithm", "run.clock": "clock", "truth.kind": "truth_kind"}
+    for setting in emulator.settings:
+        key, _, value = setting.partition("=")
+        if key in present and (found := status[present[key]]) != value.strip("\"'"):
+            problems.append(f"its {key} is {found}, not {value}")
     if status["mode"] in ("boot", "error"):
         problems.append(f"its mode is {status['mode']}")
     if script.truth.attitude is not None:
-        present = unit(rig.control("truth", {})["quaternion_xyzw"])
-        off = attitude_error(present, script.truth.attitude).total_arcsec
+        truth = unit(rig.control("truth", {})["quaternion_xyzw"])
+        off = attitude_error(truth, script.truth.attitude).total_arcsec
         if off > TRUTH_WITHIN_ARCSEC:
             problems.append(f"it looks {show_angle(off)} from where the script has the truth")
     if problems:
         command = start_command(script, folder)
         raise BenchError(
-            f"{path.name}: the emulator does not fit: {'; '.join(problems)}; start it by: {command}"
+            f"{path.name}: the emulator does not fit: {'; '.join(problems)}; use --start, or start it by: {command}"
         )
 
 

@@ -146,6 +146,11 @@ def test_the_commands_for_an_emulator_that_runs_work_as_the_page_has_them(tmp_pa
         moved = starhil("session", "slew_tracking", *session[2:], "--log", tmp_path / "other")
         assert "its profile is cubestar, not ideal" in moved.stderr
         assert "starhil run ideal --set truth.kind=rate" in moved.stderr
+        other = starhil("session", "recursive_features", *session[2:], "--log", tmp_path / "other")
+        assert other.stderr.startswith(
+            "starhil: recursive_features.toml: the emulator does not fit: its run.algorithm is geometric, not rsi; "
+            "its run.clock is real, not scaled:4; its truth.kind is fixed, not rate; use --start, or start it by: starhil run cubestar"
+        )
 
 
 def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
