@@ -25,6 +25,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# without bytecode, each of the hundreds of processes that tests start compiles the package again
+unexport PYTHONDONTWRITEBYTECODE
 
 # a target whose recipe failed is made again: the file .venv/pyvenv.cfg is written before pip is found to be missing
 .DELETE_ON_ERROR:
