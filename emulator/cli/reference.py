@@ -339,6 +339,7 @@ def dataclass_rows(kind: Any, skipped: Container[str] = ()) -> list[Row]:
 
 def identifier() -> str:
     """Options of each algorithm, as the emulator accepts them in `[identifier]`."""
+    from starhil.emulator.profile.profile import DEVICE_OPTIONS
     from starid.identification.options import ALGORITHMS
 
     parts = []
@@ -346,7 +347,9 @@ def identifier() -> str:
         texts: dict[str, str] = {}
         for kind in reversed(inspect.getmro(algorithm.options)[:-1]):
             texts |= documented_names(kind)
-        names = sorted(field.name for field in dataclasses.fields(algorithm.options))
+        names = sorted(
+            {field.name for field in dataclasses.fields(algorithm.options)} - DEVICE_OPTIONS.keys()
+        )
         rows: list[Row] = [(f"`{option}`", "", "", "", texts[option]) for option in names]
         parts.append(f'### With `run.algorithm = "{name}"`\n\n{table(rows)}')
     return "\n\n".join(parts)
@@ -399,21 +402,9 @@ def unit_definition() -> str:
         "[[parameter]]": icd_schema.ParameterModel,
         "[link.serial]": link_schema.SerialLinkModel,
         "[[link.serial.format]]": link_schema.FormatModel,
-        'framing = { kind = "escaped" }': link_schema.EscapedFraming,
-        'framing = { kind = "slip" }': link_schema.SlipFraming,
-        'framing = { kind = "length" }': link_schema.LengthFraming,
-        'framing = { kind = "fixed" }': link_schema.FixedFraming,
+        **headings_by_kind("framing", link_schema.FramingModel),
         "stuffing": link_schema.ByteStuffing,
-        'framing = { kind = "delimited" }': link_schema.DelimitedFraming,
-        'framing = { kind = "cubespace" }': link_schema.CubeSpaceFraming,
-        'framing = { kind = "custom" }': link_schema.CustomFraming,
-        'check = { kind = "none" }': link_schema.NoCheck,
-        'check = { kind = "sum" }': link_schema.SumCheck,
-        'check = { kind = "xor" }': link_schema.XorCheck,
-        'check = { kind = "fletcher16" }': link_schema.FletcherCheck,
-        'check = { kind = "crc" }': link_schema.CrcCheck,
-        'check = { kind = "xxh32" }': link_schema.XxHashCheck,
-        'check = { kind = "custom" }': link_schema.CustomCheck,
+        **headings_by_kind("check", link_schema.CheckModel),
         "request_header, reply_header": link_schema.HeaderFieldModel,
         "bits of a header": link_schema.HeaderBitModel,
         "[link.can]": link_schema.CubeSpaceCanModel,
@@ -446,6 +437,14 @@ def unit_definition() -> str:
         f"as `other`, if given; `ok` keeps its default.\n\n| key | default |\n|---|---|\n{numbers}\n| `other` | |"
     )
     return "\n\n".join(parts)
+
+
+def headings_by_kind(key: str, union: Any) -> dict[str, type[BaseModel]]:
+    """Return the models of a union that `kind` selects, each with its heading."""
+    return {
+        f'{key} = {{ kind = "{get_args(model.model_fields["kind"].annotation)[0]}" }}': model
+        for model in get_args(get_args(union)[0])
+    }
 
 
 def apart(rows: list[Row], headings: Mapping[Row, str]) -> tuple[list[Row], list[str]]:

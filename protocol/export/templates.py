@@ -9,6 +9,8 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
+from starhil.protocol.errors import IcdError
+
 FOLDER = Path(__file__).parent
 
 
@@ -34,6 +36,12 @@ def text_of(name: str) -> str:
 
 
 def part_of(name: str, heading: str) -> str:
-    """Return the part of a file of `export` under a heading, a comment of one word."""
-    _, *parts = re.split(r"^(?:#|//) (\w+)\n", text_of(name), flags=re.MULTILINE)
-    return dict(zip(parts[::2], parts[1::2], strict=True))[heading].strip("\n") + "\n"
+    """Return the part of a file of `export` under a heading, a comment of one word.
+
+    Raises IcdError: there is none, so that the export lacks what a definition selects.
+    """
+    _, *texts = re.split(r"^(?:#|//) (\w+)\n", text_of(name), flags=re.MULTILINE)
+    parts = dict(zip(texts[::2], texts[1::2], strict=True))
+    if heading not in parts:
+        raise IcdError(f"link.serial: {heading} cannot be exported: protocol/export/{name} has no such part")
+    return parts[heading].strip("\n") + "\n"

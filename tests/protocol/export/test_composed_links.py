@@ -10,9 +10,10 @@ from typing import Any
 
 import pytest
 
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.export.cosmos_plugin.composed import link_text
 from starhil.protocol.export.packets import row_key
+from starhil.protocol.export.templates import part_of
 from starhil.protocol.icd.definition import Names
 from starhil.protocol.icd.link_schema import CustomCheck, CustomFraming, SerialLinkModel
 from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
@@ -20,6 +21,7 @@ from starhil.protocol.plugin import Plugin
 from starhil.protocol.serial.stack import SerialStack
 from starhil.protocol.unit import load_unit
 from tests.protocol.export.c_driver import CDriver, hex_or_none
+from tests.protocol.serial.check_values import CHECK_VALUES
 from tests.protocol.serial.composed_links import REPLIES, REQUESTS, STACKS, definition
 
 pytestmark = pytest.mark.long
@@ -45,6 +47,18 @@ def expected(stack: SerialStack, reply: Reply) -> tuple[str, int, bytes]:
     if reply.kind is ReplyKind.NACK:
         return "answer", key, bytes((int(reply.code) or 1,))
     return "telemetry", key, reply.data
+
+
+def test_what_an_export_has_no_code_for_is_named() -> None:
+    for path in ("c/checks.c", "cosmos_plugin/checks.py.in"):
+        with pytest.raises(IcdError, match=rf"crc7 cannot be exported: protocol/export/{path} has no such"):
+            part_of(path, "crc7")
+
+
+@pytest.mark.parametrize("path", ["c/checks.c", "cosmos_plugin/checks.py.in"])
+def test_every_check_can_be_exported(path: str) -> None:
+    for model, _ in CHECK_VALUES:
+        assert "check(" in part_of(path, model["kind"])
 
 
 @pytest.mark.parametrize("name", STACKS)
