@@ -13,10 +13,8 @@ import logging
 import resource
 import socket
 import time
-import types
 from abc import abstractmethod
 from collections.abc import Awaitable, Callable, Coroutine, Generator, Iterator
-from functools import partial
 from typing import Any, Final, TypeVar, cast
 
 log: Final = logging.getLogger("starhil.connections")
@@ -109,6 +107,16 @@ class Account:
         return self._budget.rested_s
 
 
+class _Pause:
+    """Awaits what a step of a coroutine has ended with: what the coroutine itself would have passed to the event loop."""
+
+    def __init__(self, awaited: object) -> None:
+        self._awaited = awaited
+
+    def __await__(self) -> Generator[object, None, None]:
+        yield self._awaited
+
+
 class Budget:
     """The time of the event loop that the peers of a server may take, the order of their rests, and their turns."""
 
@@ -135,33 +143,30 @@ class Budget:
     async def run(self, work: Coroutine[Any, Any, Result], beside_s: float = 0.0) -> Result:
         """Await a coroutine in turns: each of its steps, up to the next await that waits, is counted, and after it the loop is others'.
 
-        What the coroutine does in tasks of its own is not counted. `beside_s` is spent on the work elsewhere, seconds.
+        What the coroutine does in tasks of its own is not counted. `beside_s` is spent on the work elsewhere, seconds. An exception
+        of what it waits for, such as a cancellation, is raised in it in its next turn.
         """
-        return await self._in_turns(work, beside_s)
-
-    @types.coroutine
-    def _in_turns(self, work: Coroutine[Any, Any, Result], beside_s: float) -> Generator[Any, Any, Result]:
-        resume: Callable[[], Any] = partial(work.send, None)
+        error: BaseException | None = None
         with contextlib.closing(work):
             while True:
                 try:
-                    yield from self._turn.acquire().__await__()
-                except asyncio.CancelledError as error:
-                    resume = partial(work.throw, error)
+                    await self._turn.acquire()
+                except asyncio.CancelledError as cancelled:
+                    error = cancelled
                     continue
                 try:
                     with self.together.taking(beside_s):
-                        awaited = resume()
+                        awaited = work.send(None) if error is None else work.throw(error)
                 except StopIteration as end:
                     result: Result = end.value
                     return result
                 finally:
                     self._end_turn()
-                beside_s = 0.0
+                beside_s, error = 0.0, None
                 try:
-                    resume = partial(work.send, (yield awaited))
-                except (Exception, asyncio.CancelledError) as error:  # noqa: BLE001 (it is for the coroutine)
-                    resume = partial(work.throw, error)
+                    await _Pause(awaited)
+                except (Exception, asyncio.CancelledError) as raised:  # noqa: BLE001 (it is for the coroutine)
+                    error = raised
 
     def _end_turn(self) -> None:
         """Give the next peer its turn when the loop has served others, and the peers together have rested."""
