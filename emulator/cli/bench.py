@@ -14,6 +14,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import DeviceAddress, Seed, SerialDialect, Unit, checked_dialect
+from starhil.emulator.cli.output import compiles
 from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starid.cli.options import AsJson, one_of
 from starid.cli.output import Column, output_help, prepare_output, print_table, progress
@@ -98,6 +99,7 @@ _CENTROID_COLUMNS: Final[tuple[Column, ...]] = (
 
 
 @group.command("centroid")
+@compiles
 def centroid(
     rates: Annotated[
         list[float] | None, typer.Option("--rate", help="Body rate, degrees/s. Repeatable.")
@@ -146,6 +148,7 @@ _BODIES_COLUMNS: Final[tuple[Column, ...]] = (
 
 
 @group.command("frame")
+@compiles
 def frame(
     frames: Annotated[int, typer.Option(min=1, help="Number of images.")] = 200,
     seed: Seed = 1,

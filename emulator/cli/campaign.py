@@ -17,6 +17,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import Jobs, OrbitChoice, Seed, Settings, names_of, with_orbit
+from starhil.emulator.cli.output import compiles
 from starid.camera import DEFAULT_FOV_DEG
 from starid.cli.options import AsJson
 from starid.cli.output import Column, print_table
@@ -150,6 +151,7 @@ class EcssOptions:
 
 
 @group.callback()
+@compiles
 @with_option_groups
 def campaigns(
     context: typer.Context,
@@ -302,6 +304,7 @@ class PlanOptions:
 
 
 @group.command("lost-in-space")
+@compiles
 @with_option_groups
 def lost_in_space(
     *,
@@ -356,6 +359,7 @@ def lost_in_space(
 
 
 @group.command("algorithms")
+@compiles
 def algorithms(
     *,
     profile: Annotated[
@@ -407,6 +411,7 @@ def algorithms(
 
 
 @group.command("orbit")
+@compiles
 def orbit_campaign(
     *,
     profile: Annotated[
@@ -446,6 +451,7 @@ def orbit_campaign(
 
 
 @group.command("tracking")
+@compiles
 def tracking(
     *,
     profile: Annotated[

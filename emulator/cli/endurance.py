@@ -21,6 +21,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import Jobs, names_of
+from starhil.emulator.cli.output import compiles
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.files.bundled import bundled_units
 from starid.cli.options import AsJson
@@ -73,6 +74,7 @@ class PlanOptions:
             yield units[number % len(units)], self.seed + number, steps, kind
 
 
+@compiles
 @with_option_groups
 def command(
     *,

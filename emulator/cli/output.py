@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Final, ParamSpec, TypeVar
 
 from starhil.emulator.errors import explained
-from starid.cli.output import prepare_output
+from starid.cli.output import compiling_reported, prepare_output
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
 
 PIPELINE: Final = "starhil.emulator.sensor.pipeline.pipeline"
 """The module whose kernels every start compiles."""
@@ -20,6 +24,17 @@ def kernel_modules(algorithms: Iterable[str] | None = None) -> list[str]:
     from starid.identification.options import ALGORITHMS
 
     return [PIPELINE, *(ALGORITHMS[name].module for name in algorithms or ALGORITHMS)]
+
+
+def compiles(command: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Let a command that compiles kernels report it; those that start an emulator do so by themselves."""
+
+    @functools.wraps(command)
+    def reporting(*args: Parameters.args, **options: Parameters.kwargs) -> Result:
+        with compiling_reported(kernel_modules()):
+            return command(*args, **options)
+
+    return reporting
 
 
 @contextmanager

@@ -12,6 +12,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import OrbitChoice, Settings, names_of, with_orbit
+from starhil.emulator.cli.output import compiles
 from starhil.emulator.errors import EmulatorError
 from starid.cli.output import output_help, prepare_output, report_stream
 
@@ -99,6 +100,7 @@ class LensOptions:
         return Camera.from_dict(values)
 
 
+@compiles
 @with_option_groups
 def command(
     *,

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from starhil.emulator.cli.options import OrbitChoice, Settings, absolute_unit, as_toml, names_of, with_orbit
-from starhil.emulator.cli.output import writing
+from starhil.emulator.cli.output import compiles, writing
 from starhil.emulator.errors import EmulatorError
 from starid.cli.options import AsJson
 from starid.cli.output import Column, output_help, prepare_output, print_table
@@ -35,6 +35,7 @@ def _columns() -> Sequence[Column]:
     )
 
 
+@compiles
 def command(
     folder: Annotated[Path, typer.Argument(help="Folder written by `starhil run --record`.")],
     profile: Annotated[

@@ -20,6 +20,7 @@ from starhil.emulator.cli import app, output
 from starid.cli import app as library
 from starid.cli import command_line
 from starid.cli.output import show_every_character
+from starid.errors import StaridError
 from starid.identification.options import ALGORITHMS
 from starid.kernels.compile_progress import CompileProgress, kernels_of
 from tests.emulator.cli.command_line import run_command_line
@@ -213,10 +214,9 @@ def test_a_slow_start_reports_its_progress_on_stderr(
     assert last.endswith("no catalogue")
 
 
-@pytest.mark.parametrize(
-    "words", ["campaign", "campaign algorithms", "bench frame", "endurance", "render --ra 1", "replay run"]
-)
-def test_a_command_that_compiles_kernels_says_so(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_command_compiles_is_reported(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """`campaign` and `bench` compiled for two minutes in silence."""
     written = iter((1, 2, 2))
     counted = threading.Event()
@@ -228,15 +228,25 @@ def test_a_command_that_compiles_kernels_says_so(words: str, monkeypatch: pytest
             counted.set()
             return 2
 
-    def run(*_arguments: object) -> None:
-        assert counted.wait(PATIENCE_S)
-        raise SystemExit(0)
-
     monkeypatch.setattr("starid.cli.output.PROGRESS_S", 0.001)
     monkeypatch.setattr("starid.storage.cache.kernels_written_since", written_since)
     monkeypatch.setattr(CompileProgress, "compiled", lambda _progress: 20)
-    monkeypatch.setattr("starid.cli.command_line.run", run)
-    _, _, said = run_command_line(*words.split())
+    assert output.compiles(counted.wait)(PATIENCE_S)
     total = len(kernels_of(output.kernel_modules()))
     line = rf"compiling: \d+ s, 20 of at most {total} kernels compiled; later runs use them\n"
-    assert re.fullmatch(2 * line, said)
+    assert re.fullmatch(2 * line, capsys.readouterr().err)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "campaign", "campaign lost-in-space", "campaign algorithms", "campaign orbit", "campaign tracking",
+        "bench centroid", "bench frame", "endurance", "render --ra 1 --dec 1 -o image.png", "replay run",
+    ],
+)  # fmt: skip
+def test_a_command_that_compiles_kernels_says_so(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def modules() -> list[str]:
+        raise StaridError("what it compiles is asked for")
+
+    monkeypatch.setattr(output, "kernel_modules", modules)
+    assert run_command_line(*words.split()) == (2, "", "starhil: what it compiles is asked for\n")
