@@ -242,8 +242,8 @@ class AroundOptions:
         for path, option in ((self.truth_log, "--truth-log"), *((file, "--record") for file in files)):
             if path is not None:
                 prepare_output(path, option)
-        for file in files:  # what an extra installs is missing before anything starts
-            importlib.import_module(RECORDERS[file.suffix].needs)
+        for needed in filter(None, (RECORDERS[file.suffix].needs for file in files)):
+            importlib.import_module(needed)  # a missing extra is reported before anything starts
         return RunOptions(
             truth_log=self.truth_log,
             overwrite=self.overwrite,

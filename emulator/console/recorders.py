@@ -32,10 +32,10 @@ class RecorderKind:
 
     use: str
     """What the file is for, in the help of the option."""
-    needs: str
-    """Module of another package that it needs, which an extra installs."""
     make: Callable[[Head, ObcConnection, EventLog, Path, bool], FileRecorder]
     """Makes a recorder for a head, with an OBC on its bus; the flag is whether an existing file is replaced."""
+    needs: str = ""
+    """Module that it needs of an extra; empty: none."""
 
 
 def _mcap(head: Head, client: ObcConnection, events: EventLog, path: Path, overwrite: bool) -> FileRecorder:
@@ -45,5 +45,5 @@ def _mcap(head: Head, client: ObcConnection, events: EventLog, path: Path, overw
 
 
 RECORDERS: Final[Mapping[str, RecorderKind]] = {
-    ".mcap": RecorderKind("for Foxglove; extra `mcap`", "mcap.writer", _mcap)
+    ".mcap": RecorderKind("for Foxglove; extra `mcap`", _mcap, needs="mcap.writer")
 }

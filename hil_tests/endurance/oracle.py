@@ -9,13 +9,14 @@ must never do.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final
 
 from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge, Motion, Readings
 from starhil.hil_tests.endurance.violation import Known, Violation
 from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.links import LINKS
 from starhil.hil_tests.judge.messages import Request, Value
 from starhil.hil_tests.judge.rows import PARAMETER, Field, Row
 from starhil.protocol.icd.units_of_measure import factor
@@ -160,6 +161,31 @@ class Oracle:
         pause_s = PIPELINE_RESTARTS_S[min(self._pipeline_ends, len(PIPELINE_RESTARTS_S) - 1)]
         self._pipeline_ready_s = self.now_s + pause_s
         self._pipeline_ends += 1
+
+    def fault_injected(self, fault: Mapping[str, Any], links: Iterable[str], now_s: float) -> None:
+        """A fault, as on the control channel, has been injected into the unit, which has these links."""
+        if "optical" in fault:
+            self.covered(fully=fault["optical"].get("blocked_share") == 1.0)
+        self.disturbed |= {link for link in links if LINKS[link].bus in fault}
+        self.time_passed(now_s)
+        if "telemetry" in fault:
+            self.content_failed(fault["telemetry"])
+        if "clock" in fault:
+            self.clock_failed(fault["clock"].get("drift_ppm", 0.0), fault["clock"].get("jump_s", 0.0))
+        device = fault.get("device", {})
+        self.stuck = bool(device.get("stuck", False)) if device else self.stuck
+        if "reset" in device:
+            self.restarted(now_s)
+        if "error" in device:
+            self.failed()
+
+    def faults_ended(self, now_s: float) -> None:
+        """All faults have been ended; what they have disturbed may still arrive."""
+        self.time_passed(now_s)
+        self.content_failed(())
+        self.clock_failed(0.0)
+        self.covered(fully=False)
+        self.stuck = False
 
     def content_failed(self, faults: Sequence[Mapping[str, Any]]) -> None:
         """The content of telemetry is wrong in these ways from now on, and in no other."""

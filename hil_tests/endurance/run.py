@@ -12,7 +12,6 @@ from starhil.hil_tests.endurance.oracle import RECOVERY_S, Oracle
 from starhil.hil_tests.endurance.unit import LiveUnit
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import Unit
-from starhil.hil_tests.judge.links import LINKS
 
 ORION: Final = {"kind": "fixed", "attitude": {"ra_deg": 83.8, "dec_deg": -1.2, "roll_deg": 0.0}}
 
@@ -106,34 +105,15 @@ class LifeRun:
     async def _fault(self, fault: Mapping[str, Any]) -> None:
         self._obc.hear()  # what was sent before
         self._unit.fault(fault)
-        oracle = self._oracle
-        if "optical" in fault:
-            oracle.covered(fully=fault["optical"].get("blocked_share") == 1.0)
-        for link in self._unit.links:
-            if LINKS[link].bus in fault:
-                oracle.disturbed.add(link)
-        oracle.time_passed(self._unit.now_s)
-        if "telemetry" in fault:
-            oracle.content_failed(fault["telemetry"])
-        if "clock" in fault:
-            oracle.clock_failed(fault["clock"].get("drift_ppm", 0.0), fault["clock"].get("jump_s", 0.0))
-        device = fault.get("device", {})
-        oracle.stuck = bool(device.get("stuck", False)) if device else oracle.stuck
-        if "reset" in device:
-            oracle.restarted(self._unit.now_s)
+        self._oracle.fault_injected(fault, self._unit.links, self._unit.now_s)
+        if "reset" in fault.get("device", {}):
             self._obc.connect()
-        if "error" in device:
-            oracle.failed()
 
     async def _clear(self) -> None:
         self._obc.hear()  # what was sent before
         self._unit.clear_faults()
         oracle = self._oracle
-        oracle.time_passed(self._unit.now_s)
-        oracle.content_failed(())
-        oracle.clock_failed(0.0)
-        oracle.covered(fully=False)
-        oracle.stuck = False
+        oracle.faults_ended(self._unit.now_s)
         if oracle.disturbed:
             await self._unit.step(10.0)  # delayed output arrives
             for link in oracle.disturbed:
