@@ -204,6 +204,12 @@ CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1"
 CAMERA_PARAMETERS: Final = CALIBRATION | {"limiting_magnitude"}
 """Device parameters that are not inherited by a profile with another camera."""
 
+DEVICE_OPTIONS: Final = {
+    "largest_error_deg": "; the device has it: device.largest_error_deg",
+    "limiting_magnitude": "; the device has it: parameters.limiting_magnitude",
+}
+"""Options of algorithms that follow from the device, and the hint for whoever writes one in `[identifier]`."""
+
 PATHS: Final = profile_paths(Profile)
 """Keys of files and folders, which refer to the folder of the profile that has them."""
 
@@ -280,11 +286,11 @@ def _problems_of_identifier(values: Mapping[str, Any]) -> Iterator[tuple[Sequenc
     if not isinstance(table, dict) or not isinstance(algorithm, str) or algorithm not in ALGORITHMS:
         return  # reported with the other keys
     options: type = ALGORITHMS[algorithm].options
-    model = plain_model(options)
+    model = plain_model(options, frozenset(DEVICE_OPTIONS))
     try:
         model.model_validate(table)
     except ValidationError as error:
-        for problem in problems(error, model, table):
+        for problem in problems(error, model, table, hints=DEVICE_OPTIONS):
             text = problem.text
             if problem.unknown:
                 text = text.replace("unknown key", f"not an option of the algorithm {algorithm}", 1)

@@ -50,6 +50,7 @@ def model_of(
     base: type[BaseModel] = Strict,
     *,
     optional: Container[str] = (),
+    without: Container[str] = (),
     replaced: Mapping[str, Any] = MappingProxyType({}),
 ) -> type[BaseModel]:
     """Return the model of a table whose keys are the fields of a dataclass, with their types, limits and defaults.
@@ -63,12 +64,16 @@ def model_of(
         Base of the model, with further keys and validators.
     optional:
         Fields that the table may lack although the record needs them.
+    without:
+        Fields that the table does not have.
     replaced:
         Types of fields that differ from those of the record; None is their default.
     """
     hints = get_type_hints(kind)
     keys: dict[str, Any] = {}
     for field in dataclasses.fields(kind):
+        if field.name in without:
+            continue
         hint = _key_type(hints[field.name], field.metadata)
         default = ... if field.default is dataclasses.MISSING else field.default
         if field.name in optional:
@@ -87,9 +92,9 @@ def model_of(
 
 
 @cache
-def plain_model(kind: type) -> type[BaseModel]:
-    """Return the model of a table whose keys are exactly the fields of a dataclass."""
-    return model_of(kind)
+def plain_model(kind: type, without: frozenset[str] = frozenset()) -> type[BaseModel]:
+    """Return the model of a table whose keys are the fields of a dataclass, or all of them but some, which have defaults."""
+    return model_of(kind, without=without)
 
 
 def _key_type(hint: Any, metadata: Mapping[str, Any]) -> Any:

@@ -93,6 +93,8 @@ class PipelineSetup:
     sky: dict[str, Any]
     identifier: dict[str, Any]
     """Fields of the camera, the sensor model and the sky objects, and options of the algorithm, by name."""
+    device: dict[str, Any]
+    """Keys of `[device]` in a profile."""
     catalog_path: str
     epoch: float
     """Catalogue file (empty: the installed one) and the Julian year of the star positions."""
@@ -105,19 +107,9 @@ class PipelineSetup:
     the new index, so that a run on the stepped clock is reproducible byte for byte."""
     previews: bool = False
     """Whether frames may be displayed, so that previews must be possible."""
-    dark_frames: int = 0
-    """Number of frames averaged into the dark frame that is subtracted from each image; 0: none."""
     calibration: list[list[float]] | None = None
     """Covariance (9, 9) of the calibrated camera's parameters, as in `starid.camera.calibration.Calibration`; None: they are
     exact."""
-    tracking_stars: int = 2
-    """Least number of stars in tracking if the error of the prediction is known; 0: as lost in space."""
-    largest_error_deg: float = 0.1
-    """Largest error of an attitude across or about the boresight, degrees; see `[device]` of a profile."""
-    wrong_predictions: float = 1e-3
-    """Share of predictions that are assumed to be wrong; see `[device]` of a profile."""
-    tracking_windows: bool = False
-    """Whether to search only windows around predicted stars first, when tracking."""
     exposure_s: float = 0.2
     """Exposure in which the limit of the detector is measured, for the algorithms that count stars."""
     images: dict[str, Any] = field(default_factory=dict)

@@ -337,13 +337,12 @@ class Pipeline:
 
     def _without_dark(self, image: NDArray[Any], request: FrameRequest) -> NDArray[Any]:
         """Subtract the unit's dark frame, scaled to the exposure, gain and temperature of the image."""
-        if self._setup.dark_frames == 0:
+        frames = self._setup.device["dark_frames"]
+        if frames == 0:
             return image
         if self._dark is None:
-            camera, setup = self.camera, self._setup
-            self._dark = measure_dark_map(
-                self._sensor, camera.height, camera.width, setup.dark_frames, setup.seed
-            )
+            camera = self.camera
+            self._dark = measure_dark_map(self._sensor, camera.height, camera.width, frames, self._setup.seed)
         temperature = self._sensor.temperature_c if request.temperature_c is None else request.temperature_c
         return self._dark.subtracted(image, request.exposure_s, request.gain, temperature)
 
@@ -384,8 +383,8 @@ class Pipeline:
 
     @property
     def _largest_error_deg(self) -> float:
-        """Largest error of an attitude, degrees: the star identifier's, by default that of the device."""
-        return float(self._setup.identifier.get("largest_error_deg", self._setup.largest_error_deg))
+        """Largest error of an attitude, degrees."""
+        return float(self._setup.device["largest_error_deg"])
 
     def _solve_or_follow(
         self,
@@ -414,7 +413,7 @@ class Pipeline:
 
         Without agreement, the given ones are returned: an attitude that is less certain than the prediction is then invalid.
         """
-        covariance, least = request.prediction_covariance, self._setup.tracking_stars
+        covariance, least = request.prediction_covariance, self._setup.device["tracking_stars"]
         predicted = self._window_centre(request)
         if covariance is None or least == 0 or predicted is None or self._leaves_trails(request):
             return detections, failed
@@ -436,7 +435,7 @@ class Pipeline:
         solution = solve_with_prediction(
             camera, stars, seen, Prediction(predicted, covariance, request.prediction_freedom),
             2.5 * log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY, self._largest_error_deg,
-            wrong_predictions=self._setup.wrong_predictions, rivals=rivals, searched=searched,
+            wrong_predictions=self._setup.device["wrong_predictions"], rivals=rivals, searched=searched,
             observer_velocity=request.observer_velocity, known=self._calibration,
         )  # fmt: skip
         if not solution.valid or solution.star_count < least:
@@ -449,7 +448,7 @@ class Pipeline:
     ) -> Detections | None:
         """Detect the brightest predicted stars in windows; None if the unit does not, or if stars leave trails."""
         predicted = self._window_centre(request)
-        if not self._setup.tracking_windows or predicted is None or self._leaves_trails(request):
+        if not self._setup.device["tracking_windows"] or predicted is None or self._leaves_trails(request):
             return None
         settings = request.settings
         stars = self._tracked_stars(settings.limiting_magnitude)
@@ -488,7 +487,7 @@ class Pipeline:
         """Return the setup of the star identifier for the parameters and the calibrated camera."""
         setup, settings = self._setup, request.settings
         options: dict[str, Any] = {**setup.identifier}
-        options.setdefault("limiting_magnitude", settings.limiting_magnitude)
+        options["limiting_magnitude"] = settings.limiting_magnitude
         options["largest_error_deg"] = self._largest_error_deg
         if setup.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
             options.setdefault("zero_point", 2.5 * log10(self._sensor.zero_magnitude_e_s))

@@ -241,7 +241,7 @@ def test_all_errors_of_a_profile_are_listed_each_with_its_source_key_and_remedy(
             f"profile {path}: camera.widht: unknown key; did you mean width?",
             f"profile {path}: sensor.read_nois: unknown key; did you mean read_noise_e, dead_pixels?",
             f"profile {path}: sensor.bits: must be one of 8, 12, 16 (given: 9)",
-            f"profile {path}: identifier.foo: not an option of the algorithm geometric; known: blend_px, cache, fov_tolerance, largest_error_deg, limiting_magnitude",
+            f"profile {path}: identifier.foo: not an option of the algorithm geometric; known: blend_px, cache, fov_tolerance",
             f"profile {path}: optical: {fault}",
             f"profile {path}: device.stuck: {fault}",
             f"profile {path}: health.t: must be a number (given: 'x')",
@@ -251,6 +251,22 @@ def test_all_errors_of_a_profile_are_listed_each_with_its_source_key_and_remedy(
             f"--set links.can.drop=1: links.can.drop: {fault}",
             f"profile {base}: parameters.k11: unknown key; did you mean k1?",
         ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("option", "key"),
+    [
+        ("largest_error_deg", "device.largest_error_deg"),
+        ("limiting_magnitude", "parameters.limiting_magnitude"),
+    ],
+)
+def test_what_follows_from_the_device_is_no_option_of_the_algorithm(option, key):
+    with pytest.raises(EmulatorError) as caught:
+        load_profile("ideal", [f"identifier.{option}=1.0"])
+    (problem,) = caught.value.args
+    assert problem.endswith(
+        f"identifier.{option}: not an option of the algorithm geometric; the device has it: {key}"
     )
 
 
