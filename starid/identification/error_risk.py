@@ -80,7 +80,7 @@ def flagged(solution: Solution, largest_error_deg: float, other_risk: float = 0.
         Probability of such an error for another reason.
     """
     risk = other_risk + error_risk(solution.covariance, solution.freedom, math.radians(largest_error_deg))
-    return solution if risk <= MAX_RISK else rejected(solution, Reason.TOO_FEW_STARS)
+    return solution if risk <= MAX_RISK else rejected(solution, Reason.UNCERTAIN)
 
 
 def rejected(solution: Solution, reason: Reason) -> Solution:

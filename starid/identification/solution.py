@@ -34,6 +34,7 @@ class Reason(StrEnum):
     AMBIGUOUS = "ambiguous"
     RESIDUAL = "residual"
     PREDICTION_LOST = "prediction_lost"
+    UNCERTAIN = "uncertain"
     BAD_INPUT = "bad_input"
 
 
