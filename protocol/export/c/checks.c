@@ -72,7 +72,11 @@ static uint32_t rotated(uint32_t value, unsigned bits)
 
 static uint64_t check(uint64_t seed, const uint8_t *bytes, size_t size)
 {
-    const uint32_t p1 = 2654435761u, p2 = 2246822519u, p3 = 3266489917u, p4 = 668265263u, p5 = 374761393u;
+    const uint32_t p1 = 2654435761u;
+    const uint32_t p2 = 2246822519u;
+    const uint32_t p3 = 3266489917u;
+    const uint32_t p4 = 668265263u;
+    const uint32_t p5 = 374761393u;
     const uint8_t *end = bytes + size;
     uint32_t value = (uint32_t)seed + p5;
     if (size >= 16u) {

@@ -1,8 +1,9 @@
 static uint64_t get_le(const uint8_t *data, unsigned size)
 {
     uint64_t value = 0u;
-    while (size-- > 0u) {
-        value = (value << 8) | data[size];
+    unsigned i;
+    for (i = size; i > 0u; --i) {
+        value = (value << 8) | data[i - 1u];
     }
     return value;
 }
@@ -21,51 +22,54 @@ static void put_le(uint8_t *data, unsigned size, uint64_t value)
 {
     unsigned i;
     for (i = 0u; i < size; ++i) {
-        data[i] = (uint8_t)(value & 0xFFu);
-        value >>= 8;
+        const unsigned shift = 8u * i;
+        data[i] = (uint8_t)((value >> shift) & 0xFFu);
     }
 }
 
 static void put_be(uint8_t *data, unsigned size, uint64_t value)
 {
-    while (size-- > 0u) {
-        data[size] = (uint8_t)(value & 0xFFu);
-        value >>= 8;
+    unsigned i;
+    for (i = 0u; i < size; ++i) {
+        const unsigned shift = 8u * (size - 1u - i);
+        data[i] = (uint8_t)((value >> shift) & 0xFFu);
     }
 }
 
 static int64_t to_signed(uint64_t value, unsigned bits)
 {
-    const uint64_t sign = (uint64_t)1 << (bits - 1u);
-    return (value & sign) != 0u ? -(int64_t)(~value & (sign - 1u)) - 1 : (int64_t)value;
+    const unsigned shift = bits - 1u;
+    const uint64_t sign = UINT64_C(1) << shift;
+    const uint64_t size = (value ^ (sign - 1u)) & (sign - 1u);
+    return (value & sign) != 0u ? (-(int64_t)size - 1) : (int64_t)value;
 }
 
 static float to_float(uint64_t raw)
 {
     const uint32_t bits = (uint32_t)raw;
     float value;
-    memcpy(&value, &bits, sizeof value);
+    (void)memcpy(&value, &bits, sizeof value);
     return value;
 }
 
 static double to_double(uint64_t bits)
 {
     double value;
-    memcpy(&value, &bits, sizeof value);
+    (void)memcpy(&value, &bits, sizeof value);
     return value;
 }
 
 static uint64_t float_bits(float value)
 {
     uint32_t bits;
-    memcpy(&bits, &value, sizeof bits);
+    (void)memcpy(&bits, &value, sizeof bits);
     return bits;
 }
 
 static uint64_t double_bits(double value)
 {
     uint64_t bits;
-    memcpy(&bits, &value, sizeof bits);
+    (void)memcpy(&bits, &value, sizeof bits);
     return bits;
 }
 
@@ -73,7 +77,8 @@ static uint64_t double_bits(double value)
 static bool to_raw(double value, double low, double high, uint64_t *raw)
 {
     uint64_t whole;
-    double size, rest;
+    double size;
+    double rest;
     if (!(value >= low - 0.5 && value <= high + 0.5)) {
         return false;
     }
@@ -92,7 +97,8 @@ static bool to_raw(double value, double low, double high, uint64_t *raw)
 static bool to_raw_single(float value, float low, float high, uint64_t *raw)
 {
     uint32_t whole;
-    float size, rest;
+    float size;
+    float rest;
     if (!(value >= low - 0.5f && value <= high + 0.5f)) {
         return false;
     }
@@ -109,7 +115,7 @@ static bool to_raw_single(float value, float low, float high, uint64_t *raw)
 
 static void get_text(const uint8_t *data, size_t size, char *text)
 {
-    memcpy(text, data, size);
+    (void)memcpy(text, data, size);
     text[size] = '\0';
 }
 
@@ -126,6 +132,6 @@ static bool put_text(uint8_t *data, size_t size, const char *text)
     if (text[i] != '\0') {
         return false;
     }
-    memset(data + i, 0, size - i);
+    (void)memset(&data[i], 0, size - i);
     return true;
 }

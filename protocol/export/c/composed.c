@@ -2,18 +2,19 @@ size_t unit_frame_request(uint32_t id, const uint8_t *data, size_t size, uint8_t
 {
     output_t output = {out, capacity, 0u};
     uint8_t *body; /* at the end of `out`, so that framing can be written to its beginning */
-    size_t header, end;
+    size_t header;
+    size_t end;
     if (!is_row(id) || capacity < UNIT_REQUEST_CAPACITY(size)) {
         return 0u;
     }
     header = header_size(id);
     end = header + size;
-    body = out + capacity - end - CHECK_SIZE;
+    body = &out[capacity - end - CHECK_SIZE];
     pack_header(id, size, body);
     if (size > 0u) {
-        memmove(body + header, data, size);
+        (void)memmove(&body[header], data, size);
     }
-    put_check(body, header, end, body + end);
+    put_check(body, header, end, &body[end]);
     put_start(&output);
     put_body(&output, body, end + CHECK_SIZE);
     put_end(&output);
@@ -22,7 +23,7 @@ size_t unit_frame_request(uint32_t id, const uint8_t *data, size_t size, uint8_t
 
 void unit_receiver_init(unit_receiver_t *receiver)
 {
-    memset(receiver, 0, sizeof *receiver);
+    (void)memset(receiver, 0, sizeof *receiver);
 }
 
 void unit_expect(unit_receiver_t *receiver, uint32_t id)
@@ -35,8 +36,12 @@ void unit_expect(unit_receiver_t *receiver, uint32_t id)
 unit_kind_t unit_give_up(unit_receiver_t *receiver)
 {
     const bool is_open = receiver->size > receiver->taken;
-    receiver->is_pending = receiver->awaits_echo = receiver->is_open = false;
-    receiver->is_escaped = receiver->is_skipping = false;
-    receiver->size = receiver->taken = 0u;
+    receiver->is_pending = false;
+    receiver->awaits_echo = false;
+    receiver->is_open = false;
+    receiver->is_escaped = false;
+    receiver->is_skipping = false;
+    receiver->size = 0u;
+    receiver->taken = 0u;
     return is_open ? UNIT_FAULT : UNIT_NONE;
 }

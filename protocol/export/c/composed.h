@@ -13,7 +13,8 @@ typedef struct {
     unit_kind_t kind;
     uint32_t id; /* row of the message */
     uint32_t code;
-    uint64_t ticks, time; /* counts in the header, if it has them */
+    uint64_t ticks; /* counts in the header, if it has them */
+    uint64_t time;
     bool is_final;        /* whether this is the last reply to the request */
     const uint8_t *data;  /* in the receiver; valid until its next call */
     size_t size;
@@ -23,9 +24,14 @@ typedef struct {
 
 /* For use by the functions below only. */
 typedef struct {
-    bool is_pending, awaits_echo, is_open, is_escaped, is_skipping;
+    bool is_pending;
+    bool awaits_echo;
+    bool is_open;
+    bool is_escaped;
+    bool is_skipping;
     uint32_t pending;
-    size_t size, taken;
+    size_t size;
+    size_t taken;
     uint8_t bytes[@BUFFER@u];
 } unit_receiver_t;
 

@@ -1,9 +1,9 @@
 unit_kind_t unit_receive(unit_receiver_t *receiver, uint8_t byte, unit_message_t *message)
 {
-    memmove(receiver->bytes, receiver->bytes + receiver->taken, receiver->size - receiver->taken);
+    (void)memmove(receiver->bytes, &receiver->bytes[receiver->taken], receiver->size - receiver->taken);
     receiver->size -= receiver->taken;
     receiver->taken = 0u;
-    memset(message, 0, sizeof *message);
+    (void)memset(message, 0, sizeof *message);
     message->kind = advance(receiver, byte, message);
     return message->kind;
 }

@@ -29,7 +29,7 @@ static unit_kind_t interpret(unit_receiver_t *receiver, const uint8_t *body, siz
         return UNIT_FAULT;
     }
     put_check(body, head.size, end, tail);
-    if (memcmp(tail, body + end, CHECK_SIZE) != 0 || !head.is_ours || !head.has_row
+    if (memcmp(tail, &body[end], CHECK_SIZE) != 0 || !head.is_ours || !head.has_row
         || head.length != length_of(head.size, end - head.size)) {
         return UNIT_FAULT;
     }
@@ -41,7 +41,7 @@ static unit_kind_t interpret(unit_receiver_t *receiver, const uint8_t *body, siz
     message->ticks = head.ticks;
     message->time = head.time;
     message->is_final = head.is_final;
-    message->data = body + head.size;
+    message->data = &body[head.size];
     message->size = end - head.size;
     if (head.is_refused) {
         return UNIT_NACK;

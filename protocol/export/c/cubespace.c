@@ -12,26 +12,32 @@ size_t unit_frame_request(uint8_t id, const uint8_t *data, size_t size, uint8_t 
     if (capacity < 2u) {
         return 0u;
     }
-    out[length++] = ESCAPE;
-    out[length++] = START;
+    out[length] = ESCAPE;
+    ++length;
+    out[length] = START;
+    ++length;
     for (i = 0u; i <= size; ++i) {
         const uint8_t byte = i == 0u ? id : data[i - 1u];
         if (capacity - length < (byte == ESCAPE ? 4u : 3u)) {
             return 0u;
         }
-        out[length++] = byte;
+        out[length] = byte;
+        ++length;
         if (byte == ESCAPE) {
-            out[length++] = ESCAPE;
+            out[length] = ESCAPE;
+            ++length;
         }
     }
-    out[length++] = ESCAPE;
-    out[length++] = END;
+    out[length] = ESCAPE;
+    ++length;
+    out[length] = END;
+    ++length;
     return length;
 }
 
 void unit_receiver_init(unit_receiver_t *receiver, unit_dialect_t dialect)
 {
-    memset(receiver, 0, sizeof *receiver);
+    (void)memset(receiver, 0, sizeof *receiver);
     receiver->dialect = dialect;
     receiver->state = IDLE;
 }
@@ -87,7 +93,8 @@ static unit_kind_t add(unit_receiver_t *receiver, uint8_t byte)
     if (receiver->size >= UNIT_MAX_MESSAGE) {
         return abandon(receiver);
     }
-    receiver->body[receiver->size++] = byte;
+    receiver->body[receiver->size] = byte;
+    ++receiver->size;
     return UNIT_NONE;
 }
 
@@ -144,7 +151,7 @@ static bool is_burst(const unit_receiver_t *receiver)
 static unit_kind_t interpret(unit_receiver_t *receiver, unit_message_t *message)
 {
     message->id = receiver->body[0];
-    message->data = receiver->body + 1;
+    message->data = &receiver->body[1];
     message->size = receiver->size - 1u;
     if (receiver->dialect == UNIT_DIALECT_C) {
         return generation_2(receiver, message);
@@ -223,7 +230,7 @@ static unit_kind_t advance(unit_receiver_t *receiver, uint8_t byte, unit_message
 
 unit_kind_t unit_receive(unit_receiver_t *receiver, uint8_t byte, unit_message_t *message)
 {
-    memset(message, 0, sizeof *message);
+    (void)memset(message, 0, sizeof *message);
     message->kind = advance(receiver, byte, message);
     return message->kind;
 }

@@ -28,8 +28,10 @@ typedef struct {
 /* For use by the functions below only. */
 typedef struct {
     unit_dialect_t dialect;
-    uint8_t state, start;
-    bool in_junk, is_pending;
+    uint8_t state;
+    uint8_t start;
+    bool in_junk;
+    bool is_pending;
     uint8_t pending;
     size_t size;
     uint8_t body[UNIT_MAX_MESSAGE];

@@ -7,27 +7,29 @@ enum { SEGMENT = 7, MAX_SEGMENTS = 256 };
 bool unit_can_request(uint8_t id, const uint8_t *data, size_t size, uint8_t address, uint8_t device, size_t number,
                       unit_can_frame_t *frame)
 {
-    const size_t frames = UNIT_CAN_FRAMES(size), start = SEGMENT * number;
+    const size_t frames = UNIT_CAN_FRAMES(size);
+    const size_t start = SEGMENT * number;
     const uint32_t command = frames > 1u ? CAN_LONG_TELECOMMAND : CAN_TELECOMMAND;
     const uint32_t type = id >= FIRST_TELEMETRY ? (uint32_t)CAN_REQUEST : command;
-    memset(frame, 0, sizeof *frame);
+    (void)memset(frame, 0, sizeof *frame);
     if (number >= frames || frames > MAX_SEGMENTS) {
         return false;
     }
     frame->id = type << 24 | (uint32_t)id << 16 | (uint32_t)address << 8 | device;
     frame->size = (uint8_t)(frames > 1u && size - start > SEGMENT ? SEGMENT : size - start);
     if (frame->size > 0u) {
-        memcpy(frame->data, data + start, frame->size);
+        (void)memcpy(frame->data, &data[start], frame->size);
     }
     if (frames > 1u) {
-        frame->data[frame->size++] = (uint8_t)(frames - 1u - number);
+        frame->data[frame->size] = (uint8_t)(frames - 1u - number);
+        ++frame->size;
     }
     return true;
 }
 
 void unit_can_receiver_init(unit_can_receiver_t *receiver, uint8_t address, uint8_t device)
 {
-    memset(receiver, 0, sizeof *receiver);
+    (void)memset(receiver, 0, sizeof *receiver);
     receiver->address = address;
     receiver->device = device;
 }
@@ -35,7 +37,9 @@ void unit_can_receiver_init(unit_can_receiver_t *receiver, uint8_t address, uint
 unit_kind_t unit_can_give_up(unit_can_receiver_t *receiver)
 {
     const bool open = receiver->telemetry.is_open || receiver->burst.is_open || receiver->unsolicited.is_open;
-    receiver->telemetry.is_open = receiver->burst.is_open = receiver->unsolicited.is_open = false;
+    receiver->telemetry.is_open = false;
+    receiver->burst.is_open = false;
+    receiver->unsolicited.is_open = false;
     return open ? UNIT_FAULT : UNIT_NONE;
 }
 
@@ -49,7 +53,7 @@ static unit_kind_t can_add(unit_can_message_t *open, bool starts, const unit_can
     const bool cut = open->is_open && (starts || open->row != message->id);
     unit_kind_t kind = cut ? UNIT_FAULT : UNIT_NONE;
     open->is_open = open->is_open && !cut && frame->size > 0u;
-    if (!open->is_open || open->is_broken || left != open->left - 1 || (left > 0u && !may_start)) {
+    if (!open->is_open || open->is_broken || left + 1u != open->left || (left > 0u && !may_start)) {
         kind = (open->is_open ? !open->is_broken : !may_start || cut) ? UNIT_FAULT : UNIT_NONE;
         open->is_broken = !may_start || (open->is_open && left < open->first);
         if (open->is_broken) {
@@ -66,7 +70,7 @@ static unit_kind_t can_add(unit_can_message_t *open, bool starts, const unit_can
     if (open->is_broken) {
         return UNIT_FAULT;
     }
-    memcpy(open->body + open->size, frame->data, size);
+    (void)memcpy(&open->body[open->size], frame->data, size);
     open->size += size;
     message->data = open->body;
     message->size = open->size;
@@ -109,9 +113,9 @@ static unit_kind_t can_interpret(unit_can_receiver_t *receiver, const unit_can_f
 
 unit_kind_t unit_can_receive(unit_can_receiver_t *receiver, const unit_can_frame_t *frame, unit_message_t *message)
 {
-    memset(message, 0, sizeof *message);
+    (void)memset(message, 0, sizeof *message);
     if ((frame->id & 0xFFu) == receiver->address && (frame->id >> 8 & 0xFFu) == receiver->device && frame->size <= 8u) {
-        memcpy(receiver->single, frame->data, sizeof receiver->single);
+        (void)memcpy(receiver->single, frame->data, sizeof receiver->single);
         message->id = (uint8_t)(frame->id >> 16);
         message->data = receiver->single;
         message->size = frame->size;

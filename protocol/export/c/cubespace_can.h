@@ -2,20 +2,28 @@
 
 typedef struct {
     uint32_t id; /* 29 bits; neither a standard nor a remote frame */
-    uint8_t size, data[8];
+    uint8_t size;
+    uint8_t data[8];
 } unit_can_frame_t;
 
 /* For use by the functions below only. */
 typedef struct {
-    bool is_open, is_broken;
-    uint8_t row, first, left;
+    bool is_open;
+    bool is_broken;
+    uint8_t row;
+    uint8_t first;
+    uint8_t left;
     size_t size;
     uint8_t body[UNIT_MAX_MESSAGE];
 } unit_can_message_t;
 
 typedef struct {
-    uint8_t address, device, single[8];
-    unit_can_message_t telemetry, burst, unsolicited;
+    uint8_t address;
+    uint8_t device;
+    uint8_t single[8];
+    unit_can_message_t telemetry;
+    unit_can_message_t burst;
+    unit_can_message_t unsolicited;
 } unit_can_receiver_t;
 
 /* Number of frames of a request with `size` bytes of data. */

@@ -30,7 +30,8 @@ static unit_kind_t advance(unit_receiver_t *receiver, uint8_t byte, unit_message
     if (byte == END_BYTE) {
         const bool is_bad = receiver->is_escaped && !receiver->is_skipping;
         const bool is_message = size > 0u && !receiver->is_escaped && !receiver->is_skipping;
-        receiver->is_escaped = receiver->is_skipping = false;
+        receiver->is_escaped = false;
+        receiver->is_skipping = false;
         receiver->taken = size;
         if (is_bad) {
             return UNIT_FAULT;
@@ -54,7 +55,8 @@ static unit_kind_t advance(unit_receiver_t *receiver, uint8_t byte, unit_message
         receiver->is_escaped = false;
         byte = byte == ESCAPED_END ? END_BYTE : ESCAPE;
     }
-    receiver->bytes[receiver->size++] = byte;
+    receiver->bytes[receiver->size] = byte;
+    ++receiver->size;
     return UNIT_NONE;
 }
 
@@ -108,7 +110,8 @@ static unit_kind_t advance(unit_receiver_t *receiver, uint8_t byte, unit_message
         receiver->taken = size;
         return UNIT_FAULT;
     }
-    receiver->bytes[receiver->size++] = byte;
+    receiver->bytes[receiver->size] = byte;
+    ++receiver->size;
     return UNIT_NONE;
 }
 
@@ -139,7 +142,7 @@ static long measure(const unit_receiver_t *receiver, const uint8_t *body, size_t
     case HEAD_SHORT:
         return 0;
     case HEAD_WHOLE:
-        return head.data_size < 0 ? -1 : (long)(head.size + CHECK_SIZE) + head.data_size;
+        return head.data_size < 0 ? -1 : (long)head.size + (long)CHECK_SIZE + head.data_size;
     default:
         return -1;
     }
@@ -148,7 +151,7 @@ static long measure(const unit_receiver_t *receiver, const uint8_t *body, size_t
 /* Examine the bytes from `start` on; true if the search has to continue at the next byte. */
 static bool look(unit_receiver_t *receiver, size_t start, unit_kind_t *kind, unit_message_t *message)
 {
-    const uint8_t *bytes = receiver->bytes + start;
+    const uint8_t *bytes = &receiver->bytes[start];
     const size_t size = receiver->size - start;
     const size_t known = size < START_SIZE ? size : START_SIZE;
     long body;
@@ -159,7 +162,7 @@ static bool look(unit_receiver_t *receiver, size_t start, unit_kind_t *kind, uni
     if (size < START_SIZE) {
         return false;
     }
-    body = measure(receiver, bytes + START_SIZE, size - START_SIZE);
+    body = measure(receiver, &bytes[START_SIZE], size - START_SIZE);
     if (body == 0) {
         return false;
     }
@@ -171,11 +174,11 @@ static bool look(unit_receiver_t *receiver, size_t start, unit_kind_t *kind, uni
     if (size < whole) {
         return false;
     }
-    if (memcmp(bytes + whole - END_SIZE, end_bytes, END_SIZE) != 0) {
+    if (memcmp(&bytes[whole - END_SIZE], end_bytes, END_SIZE) != 0) {
         *kind = UNIT_FAULT;
         return true;
     }
-    *kind = interpret(receiver, bytes + START_SIZE, (size_t)body, message);
+    *kind = interpret(receiver, &bytes[START_SIZE], (size_t)body, message);
     if (*kind == UNIT_FAULT) {
         return true;
     }
@@ -187,7 +190,8 @@ static unit_kind_t advance(unit_receiver_t *receiver, uint8_t byte, unit_message
 {
     unit_kind_t kind = UNIT_NONE;
     size_t start = 0u;
-    receiver->bytes[receiver->size++] = byte;
+    receiver->bytes[receiver->size] = byte;
+    ++receiver->size;
     while (start < receiver->size && look(receiver, start, &kind, message)) {
         ++start;
     }
@@ -239,7 +243,8 @@ static long from_hex(uint8_t *text, size_t size)
         return (long)size;
     }
     for (i = 0u; i + 1u < size; i += 2u) {
-        const int high = digit(text[i]), low = digit(text[i + 1u]);
+        const int high = digit(text[i]);
+        const int low = digit(text[i + 1u]);
         if (high < 0 || low < 0) {
             return -1;
         }
@@ -250,15 +255,19 @@ static long from_hex(uint8_t *text, size_t size)
 
 static unit_kind_t advance(unit_receiver_t *receiver, uint8_t byte, unit_message_t *message)
 {
-    size_t start = 0u, size, i;
+    size_t start = 0u;
+    size_t size;
+    size_t i;
     long body;
     if (receiver->size >= sizeof receiver->bytes) {
-        memmove(receiver->bytes, receiver->bytes + 1, --receiver->size);
+        --receiver->size;
+        (void)memmove(receiver->bytes, &receiver->bytes[1], receiver->size);
         receiver->is_skipping = true;
     }
-    receiver->bytes[receiver->size++] = byte;
+    receiver->bytes[receiver->size] = byte;
+    ++receiver->size;
     size = receiver->size;
-    if (size < END_SIZE || memcmp(receiver->bytes + size - END_SIZE, end_bytes, END_SIZE) != 0) {
+    if (size < END_SIZE || memcmp(&receiver->bytes[size - END_SIZE], end_bytes, END_SIZE) != 0) {
         return UNIT_NONE;
     }
     size -= END_SIZE;
@@ -268,8 +277,8 @@ static unit_kind_t advance(unit_receiver_t *receiver, uint8_t byte, unit_message
         return UNIT_FAULT;
     }
     if (START_SIZE != 0u) {
-        for (start = i = 0u; i + START_SIZE <= size; ++i) {
-            if (memcmp(receiver->bytes + i, start_bytes, START_SIZE) == 0) {
+        for (i = 0u; i + START_SIZE <= size; ++i) {
+            if (memcmp(&receiver->bytes[i], start_bytes, START_SIZE) == 0) {
                 start = i + START_SIZE;
             }
         }
@@ -277,6 +286,6 @@ static unit_kind_t advance(unit_receiver_t *receiver, uint8_t byte, unit_message
             return UNIT_FAULT;
         }
     }
-    body = from_hex(receiver->bytes + start, size - start);
-    return body < 0 ? UNIT_FAULT : interpret(receiver, receiver->bytes + start, (size_t)body, message);
+    body = from_hex(&receiver->bytes[start], size - start);
+    return body < 0 ? UNIT_FAULT : interpret(receiver, &receiver->bytes[start], (size_t)body, message);
 }

@@ -38,7 +38,7 @@ class RowCode:
                         enum_name(row, field), field.enum, f"map of {row.name}.{field.name}"
                     )
             name = self._name(row)
-            declared = (name, f"{name}_t", f"{name}_encode", f"{name}_decode", f"check_{name}")
+            declared = (name, f"{name}_t", f"{name}_encode", f"{name}_decode", f"{name}_check")
             macros = (f"{name}_{part}".upper() for part in ("ID", "SIZE", "INIT"))
             for claimed in (*declared, *macros):
                 scope.claim(claimed, f"{row.kind} {row.name}")
@@ -168,7 +168,7 @@ def _check(row: Row, field: Field) -> str:
         case "enum" if field.enum is not None:
             return f"!is_in_{enum_name(row, field)}({value})"
         case "float":
-            return _check_float(row, field, value)
+            return _check_float(field, value)
         case "integer" | "bits" if field.scaled:
             return f"!{_to_raw(field, value)}"
         case "integer" | "bits":
@@ -177,19 +177,18 @@ def _check(row: Row, field: Field) -> str:
             least, greatest = INTEGER_RANGES[type_]
             tests = [f"{value} < {_integer(low, signed=_signed(field))}"] * (low > least)
             tests += [f"{value} > {_integer(high, signed=_signed(field))}"] * (high < greatest)
-            return " || ".join(tests)
+            return " || ".join(f"({test})" for test in tests) if len(tests) > 1 else "".join(tests)
         case _:
             return ""
 
 
-def _check_float(row: Row, field: Field, value: str) -> str:
+def _check_float(field: Field, value: str) -> str:
+    """Return the test whether a number is not finite or exceeds its limits; a comparison with what is no number is false."""
     low, high = representable(*field.physical_limits, field.type)
-    if row.kind == "telemetry":  # which may carry what is no number
-        tests = [f"{value} < {_literal(field, low)}"] * (field.minimum is not None)
-        return " || ".join(tests + [f"{value} > {_literal(field, high)}"] * (field.maximum is not None))
     largest = "FLT_MAX" if is_single(field) else "DBL_MAX"
     lowest = _literal(field, low) if math.isfinite(low) else f"-{largest}"
-    return f"!({value} >= {lowest} && {value} <= {_literal(field, high) if math.isfinite(high) else largest})"
+    highest = _literal(field, high) if math.isfinite(high) else largest
+    return f"!(({value} >= {lowest}) && ({value} <= {highest}))"
 
 
 def _to_raw(field: Field, value: str) -> str:
@@ -207,13 +206,13 @@ def _unscaled(field: Field, value: str) -> str:
 
 def _encode(row: Row, slot: Slot) -> Iterator[str]:
     fields = [field for field in row.fields if field.slot is slot and field.name]
-    where = f"data + {slot.offset}"
+    where = f"&data[{slot.offset}]"
     if not fields:
-        yield f"memset({where}, 0, {slot.size}u);"
+        yield f"(void)memset({where}, 0, {slot.size}u);"
         return
     if fields[0].width:
         plain = " | ".join(
-            f"(uint64_t)values->{c_member(field.name)} << {field.shift}"
+            _shifted(f"(uint64_t)values->{c_member(field.name)}", "<<", field)
             for field in fields
             if not field.scaled
         )
@@ -222,14 +221,14 @@ def _encode(row: Row, slot: Slot) -> Iterator[str]:
             yield f"bits = {plain or '0u'};"
         for field in scaled:
             yield f"(void){_to_raw(field, f'values->{c_member(field.name)}')};"
-            yield f"bits |= raw << {field.shift};"
+            yield f"bits |= {_shifted('raw', '<<', field)};"
         yield _put_statement(slot, "bits" if scaled else plain)
         return
     (field,) = fields
     value = f"values->{c_member(field.name)}"
     match field.kind:
         case "bytes":
-            yield f"memcpy({where}, {value}, {slot.size}u);"
+            yield f"(void)memcpy({where}, {value}, {slot.size}u);"
         case "text":
             index = list(row.named_fields).index(field.name) + 1
             yield f"if (!put_text({where}, {slot.size}u, {value})) {{\n    return {index};\n}}"
@@ -244,8 +243,13 @@ def _encode(row: Row, slot: Slot) -> Iterator[str]:
             yield _put_statement(slot, f"(uint64_t){value}")
 
 
+def _shifted(value: str, operator: str, field: Field) -> str:
+    """Return a value shifted to the bits of a field, or from them."""
+    return f"({value} {operator} {field.shift})" if field.shift else value
+
+
 def _put_statement(slot: Slot, value: str) -> str:
-    return f"put_{_suffix(slot)}(data + {slot.offset}, {slot.size}u, {value});"
+    return f"put_{_suffix(slot)}(&data[{slot.offset}], {slot.size}u, {value});"
 
 
 def _suffix(slot: Slot) -> str:
@@ -254,16 +258,17 @@ def _suffix(slot: Slot) -> str:
 
 def _decode(field: Field) -> str:
     value = f"values->{c_member(field.name)}"
-    raw = f"get_{_suffix(field.slot)}(data + {field.offset}, {field.size}u)"
+    place = f"&data[{field.offset}], {field.size}u"
+    raw = f"get_{_suffix(field.slot)}({place})"
     if field.kind == "bytes":
-        return f"memcpy({value}, data + {field.offset}, {field.size}u);"
+        return f"(void)memcpy({value}, {place});"
     if field.kind == "text":
-        return f"get_text(data + {field.offset}, {field.size}u, {value});"
+        return f"get_text({place}, {value});"
     if field.kind == "float":
         raw = f"to_float({raw})" if field.type == "f32" else f"to_double({raw})"
         return f"{value} = {_scaled(field, raw)};"
     if field.width:
-        raw = f"(({raw} >> {field.shift}) & {2**field.width - 1:#x}u)"
+        raw = f"({_shifted(raw, '>>', field)} & {2**field.width - 1:#x}u)"
     if field.kind == "flag":
         return f"{value} = ({raw}) != 0u;"
     if _signed(field):
@@ -278,4 +283,4 @@ def _scaled(field: Field, raw: str) -> str:
         return raw
     divisor = field.divisor if field.kind != "float" else None
     factor = f"/ {_literal(field, float(divisor))}" if divisor else f"* {_literal(field, field.scale)}"
-    return f"({'float' if is_single(field) else 'double'}){raw} {factor} + {_literal(field, field.bias)}"
+    return f"(({'float' if is_single(field) else 'double'}){raw} {factor}) + {_literal(field, field.bias)}"

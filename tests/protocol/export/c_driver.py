@@ -1,6 +1,6 @@
 """A program around the exported C: it encodes, decodes and talks over a serial line as lines on its stdin ask.
 
-`decode ROW HEX`, `encode ROW VALUE…`, `frame ID HEX`, `receive DIALECT PENDING HEX`, `open PATH DIALECT`, `ask ID HEX`, and
+`decode ROW HEX`, `check ROW HEX`, `encode ROW VALUE…`, `frame ID HEX`, `receive DIALECT PENDING HEX`, `open PATH DIALECT`, `ask ID HEX`, and
 on CAN `can_frame ID HEX`, `can_receive`, `can CANID HEX`, `can_give_up`, from address 1 to 4; each is answered by one line.
 """
 
@@ -83,6 +83,12 @@ static void decode(const char *row, const uint8_t *data, size_t size)
     @decode@
 }
 
+static void check(const char *row, const uint8_t *data, size_t size)
+{
+    (void)row, (void)data, (void)size;
+    @check@
+}
+
 static void encode(const char *row)
 {
     uint8_t data[4096];
@@ -142,6 +148,9 @@ int main(void)
         if (strcmp(verb, "decode") == 0) {
             size = hex(bytes);
             decode(first, bytes, size);
+        } else if (strcmp(verb, "check") == 0) {
+            size = hex(bytes);
+            check(first, bytes, size);
         } else if (strcmp(verb, "encode") == 0) {
             encode(first);
         } else if (strcmp(verb, "frame") == 0) {
@@ -291,7 +300,16 @@ def driver_source(icd: InterfaceDefinition, *, composed: bool) -> str:
         'printf("%d", rc); if (rc == 0) { print_hex(data, SIZEu); }',
         _read,
     )
-    text = _MAIN.replace("@decode@", "\n    ".join(decode)).replace("@encode@", "\n    ".join(encode))
+    check = _cases(
+        icd,
+        '(void)NAME_decode(data, size, &values); printf("%d", NAME_check(&values));',
+        lambda _field: "",
+    )
+    text = (
+        _MAIN.replace("@check@", "\n    ".join(check))
+        .replace("@decode@", "\n    ".join(decode))
+        .replace("@encode@", "\n    ".join(encode))
+    )
     text = text.replace("@init@", "init_receiver").replace(
         "@needed@", "needed_capacity((uint32_t)atol(first), bytes, size, frame)"
     )

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import random
 import re
+import struct
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -72,6 +74,43 @@ def test_random_bytes_of_a_row_are_read_and_refused_alike(c: CDriver, row: Row) 
         assert int(result) == refused_at(row, data)
     for size in (row.size - 1, row.size + 1):
         assert c("decode", row.name, hex_or_none(bytes(size))) == ["-1"]
+
+
+def invalid_at(row: Row, data: bytes) -> int:
+    """Position of the first value that is not finite, beyond its limits or in no enumeration, from 1; 0 if all are valid."""
+    values = row.decode(data, check=False)
+    for index, (name, field) in enumerate(row.named_fields.items(), 1):
+        value = values[name]
+        if field.enum is not None:
+            if not isinstance(value, str | bool):
+                return index
+        elif field.kind in ("integer", "bits", "float") and (
+            not math.isfinite(value)
+            or (field.minimum is not None and value < field.minimum)
+            or (field.maximum is not None and value > field.maximum)
+        ):
+            return index
+    return 0
+
+
+@pytest.mark.parametrize("row", ROWS, ids=by_name)
+def test_values_that_are_not_valid_are_found_in_what_was_received(c: CDriver, row: Row) -> None:
+    rng = random.Random(row.id)
+    good = row.encode(row.example())
+    assert c("check", row.name, good.hex()) == ["0"]
+    for _ in range(20):
+        data = bytearray(good)
+        data[rng.randrange(row.size)] = rng.choice([0, 0x7F, 0xFF, rng.randrange(256)])
+        assert int(c("check", row.name, data.hex())[0]) == invalid_at(row, bytes(data))
+    for index, field in enumerate(row.named_fields.values(), 1):
+        for number in (math.nan, math.inf, -math.inf):
+            if field.kind == "float":
+                data = bytearray(good)
+                order = "<" if field.slot.order == "little" else ">"
+                data[field.offset : field.offset + field.size] = struct.pack(
+                    f"{order}{'f' if field.size == 4 else 'd'}", number
+                )
+                assert c("check", row.name, data.hex()) == [str(index)]
 
 
 @pytest.mark.parametrize("row", ROWS, ids=by_name)
