@@ -1,4 +1,4 @@
-"""Pytest plugin: fixtures for a star sensor on a serial line or a CAN bus, emulated or real.
+"""Pytest plugin: fixtures for a star tracker on a serial line or a CAN bus, emulated or real.
 
 In a test::
 
@@ -50,7 +50,7 @@ def _seconds(text: str) -> float:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add options that name a unit or the profile of the emulator."""
-    group = parser.getgroup("starhil", "star sensor under test")
+    group = parser.getgroup("starhil", "star tracker under test")
     group.addoption(
         "--starhil-serial",
         metavar="DEV",

@@ -15,7 +15,7 @@ from starid.cli import command_line
 from starid.errors import StaridError
 
 _NAMES: Final = (
-    "icd truth fmu unit run replay bench render campaign endurance session conformance hub cache docs"
+    "run session conformance render replay icd unit campaign bench endurance truth fmu hub cache docs"
 )
 
 COMMANDS: Final = {name: f"starhil.emulator.cli.{name}" for name in _NAMES.split()}

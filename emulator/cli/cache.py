@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starhil.emulator.cli.options import OrbitChoice, ProfileArgument, names_of, with_orbit
-from starhil.emulator.cli.output import kernel_modules
 from starid.cli.options import AsJson
 from starid.cli.output import compiling_reported
 
@@ -97,7 +96,7 @@ def warm(
 
     async def start(loaded: Profile) -> None:
         run = Run([loaded], previews=True)
-        with compiling_reported(kernel_modules([loaded.run.algorithm]), start=True):
+        with compiling_reported(start=True):
             try:
                 await run.open()
                 run.begin()
@@ -108,9 +107,7 @@ def warm(
     for number, each in enumerate(profiles, 1):
         log.info("%d of %d: %s, unit %s", number, len(profiles), each.name, each.unit_source)
         asyncio.run(start(each))
-    print(
-        f"{kernels_written_since(begin_s)} kernels compiled in {time.time() - begin_s:.1f} s, in {cache_dir()}"
-    )
+    print(f"{kernels_written_since(begin_s)} kernels added to {cache_dir()} in {time.time() - begin_s:.1f} s")
 
 
 @group.command("clear")

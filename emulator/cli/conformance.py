@@ -1,4 +1,4 @@
-"""`starhil conformance`: test a star sensor, emulated or real, over its bus."""
+"""`starhil conformance`: test a star tracker, emulated or real, over its bus."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def command(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Test a star sensor, emulated or real, over its bus.
+    """Test a star tracker, emulated or real, over its bus.
 
     Without --start, only cases that change nothing are run, unless --intrusive is given.
 

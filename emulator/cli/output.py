@@ -1,4 +1,4 @@
-"""Output of the commands of `starhil`: what they may compile, files and documents."""
+"""Output of the commands of `starhil`: what they compile, files and documents."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 from starhil.emulator.errors import explained
 from starid.cli.output import compiling_reported, prepare_output
@@ -15,23 +15,13 @@ from starid.cli.output import compiling_reported, prepare_output
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
-PIPELINE: Final = "starhil.emulator.sensor.pipeline.pipeline"
-"""The module whose kernels every start compiles."""
-
-
-def kernel_modules(algorithms: Iterable[str] | None = None) -> list[str]:
-    """Return the modules whose kernels an emulator with some algorithms, by default all, may compile."""
-    from starid.identification.options import ALGORITHMS
-
-    return [PIPELINE, *(ALGORITHMS[name].module for name in algorithms or ALGORITHMS)]
-
 
 def compiles(command: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
     """Let a command that compiles kernels report it; those that start an emulator do so by themselves."""
 
     @functools.wraps(command)
     def reporting(*args: Parameters.args, **options: Parameters.kwargs) -> Result:
-        with compiling_reported(kernel_modules()):
+        with compiling_reported():
             return command(*args, **options)
 
     return reporting

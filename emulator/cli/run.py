@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 import logging
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_args, get_type_hints
@@ -25,7 +25,6 @@ from starhil.emulator.cli.options import (
     names_of,
     with_orbit,
 )
-from starhil.emulator.cli.output import kernel_modules
 from starhil.emulator.cli.termination import ended_by_signals
 from starhil.emulator.console.recorders import RECORDERS
 from starhil.emulator.errors import EmulatorError
@@ -318,11 +317,10 @@ def command(
             "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
         )
     options = around.run_options()
-    algorithms = {each.run.algorithm for each in profiles}
-    return run_loop(_serve(lambda: Emulator(profiles, options, worker), algorithms))
+    return run_loop(_serve(lambda: Emulator(profiles, options, worker)))
 
 
-async def _serve(make: Callable[[], Emulator], algorithms: Collection[str]) -> int:
+async def _serve(make: Callable[[], Emulator]) -> int:
     """Run an emulator, made in the event loop, until a signal or the control channel ends it; return the exit status."""
     import gc
 
@@ -336,7 +334,7 @@ async def _serve(make: Callable[[], Emulator], algorithms: Collection[str]) -> i
         try:
             line = asyncio.create_task(_started(emulator))
             stop = asyncio.create_task(emulator.ended.wait())
-            with compiling_reported(kernel_modules(algorithms), start=True):
+            with compiling_reported(start=True):
                 await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
             if line.done():
                 gc.collect()

@@ -1,4 +1,4 @@
-"""`starhil session`: run a session script against a star sensor on a serial line, a CAN bus or both."""
+"""`starhil session`: run a session script against a star tracker on a serial line, a CAN bus or both."""
 
 from __future__ import annotations
 

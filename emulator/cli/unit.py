@@ -15,7 +15,7 @@ from starhil.protocol.files.bundled import DEFAULT_UNIT, SKELETON, bundled_units
 from starid.cli.options import AsJson
 
 group = typer.Typer(
-    help="List, create, check and describe units. A unit is the interface of a star sensor: a folder of TOML files that define "
+    help="List, create, check and describe units. A unit is the interface of a star tracker: a folder of TOML files that define "
     "its telecommands, telemetry and links.",
     no_args_is_help=True,
 )

@@ -26,5 +26,5 @@ def build_app(words: Sequence[str] = ()) -> typer.Typer:
 
 def main(words: Sequence[str] | None = None) -> None:
     """Run the command line with the given arguments, by default those of the process."""
-    with compiling_reported(["starid.photograph.solver"]):
+    with compiling_reported():
         command_line.run("starid", build_app, sys.argv[1:] if words is None else words)

@@ -54,8 +54,8 @@ COMPILED_S: Final = 120.0
 
 
 @contextmanager
-def compiling_reported(modules: Iterable[str], *, start: bool = False) -> Iterator[None]:
-    """Meanwhile, report on stderr how many kernels of some modules are compiled, whenever the number has grown.
+def compiling_reported(*, start: bool = False) -> Iterator[None]:
+    """Meanwhile, report on stderr how many kernels were added to the cache, by this process or another, whenever there are more.
 
     Of a `start`, the time that it takes is reported too, also if nothing is compiled.
     """
@@ -65,19 +65,14 @@ def compiling_reported(modules: Iterable[str], *, start: bool = False) -> Iterat
         begin_s, begin_unix_s = time.monotonic(), time.time()
         if ended.wait(PROGRESS_S):
             return
-        from starid.kernels.compile_progress import CompileProgress
         from starid.storage import cache
 
-        progress, written, compiled, grown_s = None, 0, "", begin_s
+        written, compiled, grown_s = 0, "", begin_s
         while True:
             before, written = written, cache.kernels_written_since(begin_unix_s)
             if written > before:
                 grown_s = time.monotonic()
-                progress = progress or CompileProgress(modules)
-                at_most = len(progress.kernels)  # some options need fewer
-                compiled = (
-                    f", {progress.compiled()} of at most {at_most} kernels compiled; later runs use them"
-                )
+                compiled = f", kernels added to the cache: {written}; later runs use them"
             if start or written > before:
                 what = "starting" if start else "compiling"
                 print(f"{what}: {time.monotonic() - begin_s:.0f} s{compiled}", file=sys.stderr, flush=True)
