@@ -333,30 +333,30 @@ def merge_close_stars(
     for bright, faint in pairs[np.lexsort((rank[pairs[:, 1]], rank[pairs[:, 0]]))].tolist():
         if leader[bright] == bright and leader[faint] == faint:
             leader[faint] = bright
-    flux = flux_ratio(catalog.magnitude(band))
-    positions = catalog.vectors
+    absorbed = np.flatnonzero(leader != np.arange(len(catalog)))
+    members = np.union1d(absorbed, leader[absorbed])  # few of the stars; the others stay as they are
+    leaders = leader[members]
+    flux = np.zeros(len(catalog))
+    flux[members] = flux_ratio(catalog.magnitude(band)[members])
+    positions = catalog.vectors[members]
     if as_fitted:
-        gap = positions - positions[leader]
+        gap = positions - catalog.vectors[leaders]
         distance = lengths(gap) / max(_chord(separation_rad), 1e-12)
-        positions = positions[leader] + fitted_share(distance, flux / flux[leader])[:, None] * gap
+        share = fitted_share(distance, flux[members] / flux[leaders])
+        positions = catalog.vectors[leaders] + share[:, None] * gap
     sums = np.zeros((len(catalog), 3))
-    np.add.at(sums, leader, positions * flux[:, None])
-    kept = np.flatnonzero(leader == np.arange(len(catalog)))
-    grown = np.bincount(leader, minlength=len(catalog))[kept] > 1
-    vectors = catalog.vectors[kept].copy()
-    vectors[grown] = sums[kept][grown] / lengths(sums[kept][grown])[:, None]
-    magnitudes = {}
+    np.add.at(sums, leaders, positions * flux[members][:, None])
+    grown = np.unique(leaders)
+    columns = {name: getattr(catalog, name).copy() for name in ("vectors", "ra_rad", "dec_rad", "hp", "v")}
+    centres = sums[grown] / lengths(sums[grown])[:, None]
+    columns["vectors"][grown] = centres
+    columns["ra_rad"][grown] = elementwise(atan2, centres[:, 1], centres[:, 0]) % (2.0 * math.pi)
+    columns["dec_rad"][grown] = elementwise(asin, np.clip(centres[:, 2], -1.0, 1.0))
     for name in ("hp", "v"):
-        values = getattr(catalog, name)
-        summed = -2.5 * elementwise(log10, np.bincount(leader, flux_ratio(values), len(catalog))[kept])
-        magnitudes[name] = np.where(grown, summed, values[kept])
-    ra = np.where(
-        grown, elementwise(atan2, vectors[:, 1], vectors[:, 0]) % (2.0 * math.pi), catalog.ra_rad[kept]
-    )
-    dec = np.where(grown, elementwise(asin, np.clip(vectors[:, 2], -1.0, 1.0)), catalog.dec_rad[kept])
-    merged = dataclasses.replace(
-        catalog.subset(kept), vectors=vectors, ra_rad=ra, dec_rad=dec, hp=magnitudes["hp"], v=magnitudes["v"]
-    )
+        light = np.bincount(leaders, flux_ratio(getattr(catalog, name)[members]), len(catalog))[grown]
+        columns[name][grown] = -2.5 * elementwise(log10, light)
+    kept = np.flatnonzero(leader == np.arange(len(catalog)))
+    merged = dataclasses.replace(catalog, **columns).subset(kept)
     return merged.subset(np.argsort(merged.v, kind="stable"))
 
 
