@@ -121,9 +121,7 @@ class TelecommandBinding:
         name = row.action or "nothing"
         self._action = _action_of(name, icd)
         self._may_have_crc = icd.conventions.telecommand_crc
-        self._reported = any(
-            field.telecommand == row.name for other in icd.telemetry.values() for field in other.fields
-        )
+        self._reported = row.name in icd.reported_telecommands
         model = icd.model.actions.get(name)
         declared = {} if model is None else {item.name: item for item in model.arguments}
         self._fixed: dict[str, Any] = {

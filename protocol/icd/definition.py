@@ -117,6 +117,12 @@ class InterfaceDefinition:
         return [row for row in self.telemetry.values() if not row.only_sent]
 
     @cached_property
+    def reported_telecommands(self) -> frozenset[str]:
+        """Names of the telecommands of which telemetry reports what was accepted last."""
+        fields = (field for row in self.telemetry.values() for field in row.fields)
+        return frozenset(field.telecommand for field in fields if field.telecommand is not None)
+
+    @cached_property
     def selects_unsolicited(self) -> bool:
         """Whether a telecommand or a parameter may select any telemetry row to be sent unsolicited."""
         actions = SELECTING_ACTIONS.union(self.plugin.actions)
