@@ -11,6 +11,7 @@ import ast
 import functools
 import gc
 import importlib
+import re
 import sys
 import tomllib
 import types
@@ -21,6 +22,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
+_IMPORT = re.compile(
+    r"^ *(?:from|import) (?P<module>starhil[\w.]*)(?: import (?P<names>\([^)]*\)|.*))?", re.MULTILINE
+)
 _CONSTANTS = (bool, int, float, str, bytes, tuple, frozenset, dict)
 
 
@@ -75,8 +79,9 @@ def planted(*edits: Edit) -> Iterator[None]:
     with ExitStack() as stack:
         for module, source in changes:
             stack.enter_context(_exchanged(module, source))
-        _forget()
-        stack.callback(_forget)
+        names = {module.__name__ for module, _ in changes}
+        _forget(names)
+        stack.callback(_forget, names)
         yield
 
 
@@ -214,9 +219,30 @@ def _meaning(code: types.CodeType) -> tuple[object, ...]:
     return code.co_code, code.co_names, code.co_varnames, code.co_freevars, *constants
 
 
-def _forget() -> None:
-    """Clear what the product has computed once, such as the definitions of units and tables of checks."""
-    modules = [module for name, module in sys.modules.items() if name.startswith("starhil.")]
-    for item in {id(item): item for module in modules for item in vars(module).values()}.values():
+def _forget(changed: set[str]) -> None:
+    """Clear what changed modules, and those that import them, have computed once, such as the definitions of units and tables of checks."""
+    modules = {
+        name: module
+        for name, module in sys.modules.items()
+        if name.startswith("starhil.") and getattr(module, "__file__", None)
+    }
+    reached: set[str] = set()
+    while changed - reached:
+        reached |= changed
+        changed = {name for name, module in modules.items() if not reached.isdisjoint(_imports(module))}
+    values = [value for name in reached for value in vars(modules[name]).values()]
+    for item in {id(value): value for value in values}.values():
         if isinstance(item, functools._lru_cache_wrapper):
             item.cache_clear()
+
+
+@functools.cache
+def _imports(module: types.ModuleType) -> set[str]:
+    """Return the modules of the package that a module imports anywhere."""
+    names = set()
+    for match in _IMPORT.finditer(Path(str(module.__file__)).read_text(encoding="utf-8")):
+        names |= {
+            match["module"],
+            *(f"{match['module']}.{name}" for name in re.findall(r"\w+", match["names"] or "")),
+        }
+    return names
