@@ -723,14 +723,21 @@ IMPOSSIBLE_LINES = {
 """Entries that cannot happen to the device."""
 
 
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    return tmp_path_factory.mktemp("original") / "recorded"
+
+
 @pytest.fixture
-def recorded(record):
-    """A short recording."""
+def recorded(record, original, tmp_path):
+    """A copy of a short recording, which is made once."""
 
     async def scenario(emulation, _line):
         await talk(emulation, 2)
 
-    return record(scenario)
+    if not original.exists():
+        shutil.copytree(record(scenario), original)
+    return shutil.copytree(original, tmp_path / "recorded", dirs_exist_ok=True)
 
 
 def with_line(recorded, line):

@@ -43,9 +43,14 @@ LOST_DEG = 180.0
 """The error of an image without an attitude."""
 
 
+@functools.cache
+def bright_stars():
+    return load_catalog().brighter_than(6.5)
+
+
 def image(rng, attitude, false_stars=0):
     """Positions and fluxes of the stars to V 6, with noise and false stars."""
-    stars = load_catalog().brighter_than(6.5)
+    stars = bright_stars()
     xy, inside = DEFAULT_CAMERA.project(attitude.to_sensor(stars.vectors))
     magnitude = stars.v + rng.normal(0.0, 0.02, len(stars))
     seen = inside & (magnitude <= LIMIT)
@@ -77,6 +82,7 @@ def error_deg(solution, attitude):
     return solution.attitude.error_to(attitude).cross_boresight_arcsec / 3600.0 if solution.valid else np.nan
 
 
+@functools.cache
 def slew(rate_deg, false_stars=0, part=None):
     """Errors of the boresight, degrees, and number of frames answered from the region, through sequences."""
     rsi = identifier(RsiIdentifier, True, part)  # noqa: FBT003 (refinement)

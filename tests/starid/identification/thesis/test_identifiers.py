@@ -40,8 +40,13 @@ def lsi():
     return LsiIdentifier()
 
 
+@functools.cache
+def bright_stars():
+    return load_catalog().brighter_than(6.5)
+
+
 def points(rng, attitude, *, magnitude_sigma=0.1, false_stars=0):
-    stars = load_catalog().brighter_than(6.5)
+    stars = bright_stars()
     xy, inside = DEFAULT_CAMERA.project(attitude.to_sensor(stars.vectors))
     magnitude = stars.v + rng.normal(0.0, magnitude_sigma, len(stars))
     seen = inside & (magnitude <= 6.0)
