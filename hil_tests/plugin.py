@@ -186,11 +186,11 @@ def starhil_emulator(request: pytest.FixtureRequest) -> EmulatorProcess:
     if unit:
         pytest.skip(f"{unit} names a unit, and this test needs an emulator")
     marker = request.node.get_closest_marker("starhil")
-    wanted = {} if marker is None else dict(marker.kwargs)
-    profile, settings = wanted.pop("profile", None), wanted.pop("settings", ())
+    options = {} if marker is None else dict(marker.kwargs)
+    profile, settings = options.pop("profile", None), options.pop("settings", ())
     texts = [*settings, profile or ""] if isinstance(settings, (list, tuple)) else [None]
     right = all(isinstance(text, str) and "\0" not in text for text in texts)
-    if not right or wanted or (marker is not None and marker.args):
+    if not right or options or (marker is not None and marker.args):
         pytest.fail(
             'the marker starhil takes profile="NAME" and settings=["section.key=value", …]', pytrace=False
         )

@@ -122,13 +122,13 @@ class Comparison:
             if name != skipped
         }
 
-    def rows(self, scene: Scene, seen: Callable[[], object]) -> Iterator[dict[str, Any]]:
-        """One row per algorithm: shares, errors, times and memory under a condition; `seen` is called after each image."""
+    def rows(self, scene: Scene, advance: Callable[[], object]) -> Iterator[dict[str, Any]]:
+        """One row per algorithm: shares, errors, times and memory under a condition; `advance` is called after each image."""
         tallies = {name: _Tally(device, scene, self.plan.without) for name, device in self.devices.items()}
         for image in self._images(scene):
             for tally in tallies.values():
                 tally.add(image)
-            seen()
+            advance()
         for name, tally in tallies.items():
             yield {
                 "profile": self.plan.profile,
@@ -312,9 +312,9 @@ class _Tally:
 
 
 def run_algorithms(
-    plan: AlgorithmPlan, scenes: tuple[Scene, ...] = SCENES, seen: Callable[[], object] = lambda: None
+    plan: AlgorithmPlan, scenes: tuple[Scene, ...] = SCENES, advance: Callable[[], object] = lambda: None
 ) -> Iterator[dict[str, Any]]:
-    """Yield the rows of the table of a profile as they are measured; `seen` is called after each image."""
+    """Yield the rows of the table of a profile as they are measured; `advance` is called after each image."""
     comparison = Comparison(plan)
     for scene in scenes:
-        yield from comparison.rows(scene, seen)
+        yield from comparison.rows(scene, advance)

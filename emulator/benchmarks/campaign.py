@@ -306,51 +306,60 @@ def run_campaign(
         yield results["rows"]
 
 
-def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
-    """Summarise the rows (RECORD) of a campaign: counts, errors in arcseconds, times in milliseconds.
+def error_figures(rows: npt.NDArray[np.void]) -> dict[str, Any]:
+    """Return counts, and errors of the valid attitudes in arcseconds, of rows that are sorted by frame.
 
-    `wrong` counts valid attitudes with an error of more than 0.1° in boresight or roll. `pole_frames` and
-    `ra_wrap_frames` count frames with a celestial pole, or RA 0°, in the field; `…_valid` counts the valid
-    ones among them. `normalised_squared_error` is the mean of the squared error divided by its covariance. If
-    the body rate varies, `valid_pct_by_rate` is the percentage of valid frames in bins up to 0.5, 1, 1.5 …
-    °/s.
+    `wrong` counts valid attitudes with an error of more than 0.1° in boresight or roll. `normalised_squared_error` is the mean of
+    the squared error divided by its covariance.
     """
-    rows = rows[np.argsort(rows["frame"], kind="stable")]  # sums in the same order with any number of jobs
     valid = rows[rows["valid"]]
-    limit = 3600 * WRONG_DEG
-    wrong = valid[(valid["cross_arcsec"] > limit) | (valid["roll_arcsec"] > limit)]
-    half = fov_deg / 2
-    away = np.abs((rows["ra_deg"] + 180) % 360 - 180) * np.cos(np.deg2rad(rows["dec_deg"]))
-    pole = np.abs(rows["dec_deg"]) > 90 - half
-    wrap = away < half
-    total = rows["render_ms"] + rows["detect_ms"] + rows["identify_ms"]
+    wrong = valid[np.maximum(valid["cross_arcsec"], valid["roll_arcsec"]) > 3600.0 * WRONG_DEG]
 
     def of_valid(name: str, percent: float) -> float | None:
         return float(np.percentile(valid[name], percent)) if len(valid) else None
 
-    def median(values: Array) -> float:
-        return float(np.median(values))
-
-    figures: dict[str, Any] = {
+    return {
         "frames": len(rows),
         "valid": len(valid),
-        "valid_pct": 100 * len(valid) / len(rows),
+        "valid_pct": 100.0 * len(valid) / len(rows),
         "wrong": len(wrong),
-        "wrong_frames": [int(frame) for frame in np.sort(wrong["frame"])],
+        "wrong_frames": [int(frame) for frame in wrong["frame"]],
         "invalid_reasons": dict(Counter(str(reason) for reason in rows["reason"][~rows["valid"]])),
-        "pole_frames": int(np.sum(pole)),
-        "pole_frames_valid": int(np.sum(pole & rows["valid"])),
-        "ra_wrap_frames": int(np.sum(wrap)),
-        "ra_wrap_frames_valid": int(np.sum(wrap & rows["valid"])),
         "median_arcsec": of_valid("cross_arcsec", 50),
         "p99_arcsec": of_valid("cross_arcsec", 99),
         "max_arcsec": of_valid("cross_arcsec", 100),
         "roll_median_arcsec": of_valid("roll_arcsec", 50),
         "roll_p99_arcsec": of_valid("roll_arcsec", 99),
         "normalised_squared_error": float(np.mean(valid["normalised_squared_error"])) if len(valid) else None,
-        "normalised_squared_error_frames": len(valid),
-        "stars_median": median(rows["detected"]),
         "matched_median": of_valid("matched", 50),
+    }
+
+
+def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
+    """Summarise the rows (RECORD) of a campaign: the figures of `error_figures`, more counts, times in milliseconds.
+
+    `pole_frames` and `ra_wrap_frames` count frames with a celestial pole, or RA 0°, in the field; `…_valid` counts the valid
+    ones among them. If the body rate varies, `valid_pct_by_rate` is the percentage of valid frames in bins up to 0.5, 1, 1.5 …
+    °/s.
+    """
+    rows = rows[np.argsort(rows["frame"], kind="stable")]  # sums in the same order with any number of jobs
+    half = fov_deg / 2
+    away = np.abs((rows["ra_deg"] + 180) % 360 - 180) * np.cos(np.deg2rad(rows["dec_deg"]))
+    pole = np.abs(rows["dec_deg"]) > 90 - half
+    wrap = away < half
+    total = rows["render_ms"] + rows["detect_ms"] + rows["identify_ms"]
+
+    def median(values: Array) -> float:
+        return float(np.median(values))
+
+    figures: dict[str, Any] = {
+        **error_figures(rows),
+        "pole_frames": int(np.sum(pole)),
+        "pole_frames_valid": int(np.sum(pole & rows["valid"])),
+        "ra_wrap_frames": int(np.sum(wrap)),
+        "ra_wrap_frames_valid": int(np.sum(wrap & rows["valid"])),
+        "normalised_squared_error_frames": int(np.sum(rows["valid"])),
+        "stars_median": median(rows["detected"]),
         **{f"median_ms_{stage}": median(rows[f"{stage}_ms"]) for stage in STAGES},
         **{f"p99_ms_{stage}": float(np.percentile(rows[f"{stage}_ms"], 99)) for stage in STAGES},
         "median_ms_frame": median(total),

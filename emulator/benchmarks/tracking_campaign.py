@@ -8,7 +8,6 @@ prediction. One image in twenty has a celestial pole, or RA 0°, in the middle o
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, run_parts, store_with_device
+from starhil.emulator.benchmarks.campaign import error_figures, of_thread, run_parts, store_with_device
 from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
 from starhil.emulator.device.parameters import exposure_period_s
 from starhil.emulator.errors import EmulatorError
@@ -100,15 +99,15 @@ class TrackingDevice(EcssDevice):
         last = self._request(number, self._images, truth.rotated(turn), rate)
         if plan.blocked > 0.0:
             last = replace(last, faults=edge)
-        known = history.uncertainty(0.0) if history.last and history.last[0] < 0.0 else None
+        uncertainty = history.uncertainty(0.0) if history.last and history.last[0] < 0.0 else None
         for way in WAYS:
             request = last
-            if way == TRACKED and known is not None:
+            if way == TRACKED and uncertainty is not None:
                 request = replace(
                     last,
                     predicted=history.predict(0.0, history.rate()),
-                    prediction_covariance=known[0],
-                    prediction_freedom=known[1],
+                    prediction_covariance=uncertainty[0],
+                    prediction_freedom=uncertainty[1],
                     predicted_rate_rad_s=history.rate(),
                 )
             result = self._answer(request)
@@ -174,35 +173,15 @@ def run_tracking(plan: TrackingPlan, *, folder: Path | None = None, jobs: int = 
 
 
 def summarise(results: list[Results]) -> list[dict[str, Any]]:
-    """Return one row per way: counts, errors in arcseconds, median times in milliseconds.
-
-    `wrong` counts valid attitudes with an error of more than 0.1° in boresight or roll.
-    """
-    rows = np.concatenate([part["rows"] for part in results])
-    return [{"way": way, **_figures(np.sort(rows[rows["way"] == way], order="frame"))} for way in WAYS]
-
-
-def _figures(rows: np.ndarray) -> dict[str, Any]:
-    valid = rows[rows["valid"]]
-    wrong = valid[np.maximum(valid["cross_arcsec"], valid["roll_arcsec"]) > 3600.0 * WRONG_DEG]
-
-    def of_valid(name: str, percent: float) -> float | None:
-        return float(np.percentile(valid[name], percent)) if len(valid) else None
-
-    return {
-        "frames": len(rows),
-        "valid": len(valid),
-        "valid_pct": 100.0 * len(valid) / len(rows),
-        "wrong": len(wrong),
-        "wrong_frames": [int(frame) for frame in wrong["frame"]],
-        "invalid_reasons": dict(Counter(str(reason) for reason in rows["reason"][~rows["valid"]])),
-        "cross_median_arcsec": of_valid("cross_arcsec", 50),
-        "cross_p99_arcsec": of_valid("cross_arcsec", 99),
-        "roll_median_arcsec": of_valid("roll_arcsec", 50),
-        "roll_p99_arcsec": of_valid("roll_arcsec", 99),
-        "max_arcsec": float(np.max([valid["cross_arcsec"], valid["roll_arcsec"]])) if len(valid) else None,
-        "normalised_squared_error": float(np.mean(valid["normalised_squared_error"])) if len(valid) else None,
-        "matched_median": of_valid("matched", 50),
-        "detect_ms": float(np.median(rows["detect_ms"])),
-        "identify_ms": float(np.median(rows["identify_ms"])),
-    }
+    """Return one row per way: the figures of `error_figures`, and median times in milliseconds."""
+    rows = np.sort(np.concatenate([part["rows"] for part in results]), order="frame")
+    return [
+        {
+            "way": way,
+            **error_figures(solved),
+            "detect_ms": float(np.median(solved["detect_ms"])),
+            "identify_ms": float(np.median(solved["identify_ms"])),
+        }
+        for way in WAYS
+        for solved in (rows[rows["way"] == way],)
+    ]

@@ -81,7 +81,7 @@ _TRACKING_COLUMNS: Final[tuple[Column, ...]] = (
     ("images", lambda row: str(row["frames"])),
     ("valid", lambda row: str(row["valid"])),
     ("wrong", lambda row: str(row["wrong"])),
-    ("across median, 99 % arcsec", lambda row: _pair(row, "cross_median_arcsec", "cross_p99_arcsec")),
+    ("across median, 99 % arcsec", lambda row: _pair(row, "median_arcsec", "p99_arcsec")),
     ("about", lambda row: _pair(row, "roll_median_arcsec", "roll_p99_arcsec")),
     ("chi2", _number("normalised_squared_error", 2)),
     ("stars", _number("matched_median", 0)),

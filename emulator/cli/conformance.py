@@ -163,14 +163,14 @@ def command(
 
     request, junit = cases.request(bench, tuple(patterns or ()), list_only=list_only), bench.junit
     console = Console(highlight=False, quiet=as_json)
-    chosen, left_out = requested_cases(request)
+    requested, left_out = requested_cases(request)
     if list_only:
-        for item in chosen:
+        for item in requested:
             kind = "intrusive" if item.intrusive else "safe"
             print(f"{item.id}\t{kind}\t{item.title}\t{item.clause}")
     if left_out:
         notice = Console(stderr=True, highlight=False) if list_only else console
-        notice.print(left_out_text(left_out, [*chosen, *left_out]), soft_wrap=True)
+        notice.print(left_out_text(left_out, [*requested, *left_out]), soft_wrap=True)
     if list_only:
         return
     for path in (junit, html):
@@ -183,7 +183,7 @@ def command(
             console=console, transient=True, disable=not console.is_terminal or as_json,
         ) as progress,
     ):  # fmt: skip
-        bar = progress.add_task("starting" if request.start else "", total=len(chosen))
+        bar = progress.add_task("starting" if request.start else "", total=len(requested))
 
         def show(outcome: Outcome) -> None:
             progress.update(bar, advance=outcome.status != NOT_RUN, description=outcome.id)

@@ -311,11 +311,11 @@ class Obc:
 
     async def cut(self, link: str, row: Sequence[Any], share: float) -> None:
         """Send the first part of a request, as a client that disconnects does; on a bus it must not be answered."""
-        known = self._definition.by_key.get((row[0], row[1]))
-        if link in self._oracle.disturbed or known is None:
+        row_definition = self._definition.by_key.get((row[0], row[1]))
+        if link in self._oracle.disturbed or row_definition is None:
             return
-        content = b"" if known.is_telemetry else bytes(known.size)
-        self._ports[link].cut(self._definition.request(known, content), share)
+        content = b"" if row_definition.is_telemetry else bytes(row_definition.size)
+        self._ports[link].cut(self._definition.request(row_definition, content), share)
         if link != "serial":
             await self.pass_time(TIME_OUT_S)
             return

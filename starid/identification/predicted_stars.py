@@ -108,7 +108,7 @@ def expected_places(
 def solve_with_prediction(
     camera: Camera,
     stars: StarCatalog,
-    found: Detections,
+    detections: Detections,
     prediction: Prediction,
     zero_point: float,
     max_false_probability: float,
@@ -118,7 +118,7 @@ def solve_with_prediction(
     rivals: Array | None = None,
     searched: Mask | None = None,
     observer_velocity: Array | None = None,
-    known: Array | None = None,
+    camera_covariance: Array | None = None,
 ) -> Solution:
     """Find the attitude from the stars near their predicted places.
 
@@ -128,7 +128,7 @@ def solve_with_prediction(
         The camera of the positions.
     stars : StarCatalog
         Stars that may be seen.
-    found : Detections
+    detections : Detections
         Detections near these places, also faint ones; see `starid.imaging.star_windows.detect_near`.
     prediction : Prediction
         The predicted attitude.
@@ -146,7 +146,7 @@ def solve_with_prediction(
         Whether anything can be found at each place that `expected_places` returns; by default at each.
     observer_velocity : ndarray (3,), optional
         See `starid.identification.star_identifier.StarIdentifier.identify`.
-    known : ndarray (9, 9), optional
+    camera_covariance : ndarray (9, 9), optional
         Covariance of the camera's parameters.
 
     Returns
@@ -157,20 +157,20 @@ def solve_with_prediction(
     invalid = Solution.invalid(Reason.PREDICTION_LOST, mode="tracking")
     predicted, covariance, _ = prediction
     rows, places = expected_places(camera, stars, predicted, observer_velocity)
-    if len(found) < MIN_STARS or len(rows) < MIN_STARS:
+    if len(detections) < MIN_STARS or len(rows) < MIN_STARS:
         return Solution.invalid(Reason.TOO_FEW_STARS, mode="tracking")
-    seen = camera.back_project(places)
-    slopes = rotation_jacobian(camera.params, seen)
-    errors = error_matrices(found.position_errors)
-    off = found.xy_px[None, :, :] - places[:, None, :]
-    known = np.zeros((9, 9)) if known is None else known
-    by_camera = camera_jacobian(camera.params, seen)
-    spread = carried(slopes, covariance) + carried(by_camera, known)
+    directions = camera.back_project(places)
+    slopes = rotation_jacobian(camera.params, directions)
+    errors = error_matrices(detections.position_errors)
+    off = detections.xy_px[None, :, :] - places[:, None, :]
+    camera_covariance = np.zeros((9, 9)) if camera_covariance is None else camera_covariance
+    by_camera = camera_jacobian(camera.params, directions)
+    spread = carried(slopes, covariance) + carried(by_camera, camera_covariance)
     gates = spread[:, None] + errors[None, :]
     distance2 = _squares(off, inverse(gates))
     with np.errstate(divide="ignore", invalid="ignore"):
-        fainter = zero_point - 2.5 * elementwise(log10, found.flux)[None, :] - stars.v[rows][:, None]
-    blur = 1.0857 * found.flux_sigma / found.flux
+        fainter = zero_point - 2.5 * elementwise(log10, detections.flux)[None, :] - stars.v[rows][:, None]
+    blur = 1.0857 * detections.flux_sigma / detections.flux
     fits = (distance2 <= GATE) & (np.abs(fainter) <= MAGNITUDE_GATE + 3.0 * blur[None, :])
     pairs = _assigned(distance2 + np.where(fits, 0.0, np.inf))
     while len(pairs) >= MIN_STARS:
@@ -189,12 +189,12 @@ def solve_with_prediction(
         return invalid
     gate = gates[place, row]
     area = math.pi * GATE * np.sqrt(gate[:, 0, 0] * gate[:, 1, 1] - gate[:, 0, 1] * gate[:, 1, 0])
-    ratio = np.maximum(found.flux[row] / found.flux_sigma[row], 1.0)
+    ratio = np.maximum(detections.flux[row] / detections.flux_sigma[row], 1.0)
     magnitude = stars.v[rows]
     alike = np.abs(magnitude[place, None] - magnitude[None, :]) <= MAGNITUDE_GATE + 3.0 * blur[row, None]
     windows = (alike if searched is None else alike & searched).sum(axis=1)
     density = alike.sum(axis=1) / (camera.width * camera.height)
-    by_chance = windows * (noise_peaks(ratio, found.psf_sigma_px) + density)
+    by_chance = windows * (noise_peaks(ratio, detections.psf_sigma_px) + density)
     if rivals is not None:
         by_chance = by_chance + rivals[row]
     log_false = math.fsum(log(each / (k + 1.0)) for k, each in enumerate((area * by_chance).tolist()))
@@ -212,7 +212,7 @@ def solve_with_prediction(
         detection_index=row,
         catalog_index=rows[place],
         hip=stars.hip[rows[place]],
-        covariance=noise + carried_on + carried(from_camera, known),
+        covariance=noise + carried_on + carried(from_camera, camera_covariance),
         freedom=freedom,
         rms_px=math.sqrt(float(np.mean(np.sum(square(residual), axis=1)))),
         sigma_px=math.sqrt(float(np.mean(errors[row, 0, 0] + errors[row, 1, 1])) / 2.0),
@@ -225,14 +225,14 @@ def solve_with_prediction(
 
 def _assigned(cost: Array) -> Indices:
     """Pairs (k, 2) of rows and columns of finite cost, cheapest first, each row and column once."""
-    chosen: list[tuple[int, int]] = []
+    pairs: list[tuple[int, int]] = []
     left = cost.copy()
     while left.size and np.isfinite(left.min()):
         i, j = divmod(int(np.argmin(left)), left.shape[1])
-        chosen.append((i, j))
+        pairs.append((i, j))
         left[i, :] = np.inf
         left[:, j] = np.inf
-    return np.array(chosen, dtype=np.int64).reshape(-1, 2)
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
 def _combined(slopes: Array, off: Array, weights: Array, covariance: Array) -> tuple[Array, Array, Array]:

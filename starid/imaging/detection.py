@@ -548,7 +548,7 @@ def _moments(scene: _Scene, peaks: Indices32, shape: SpotShape) -> Table:
 
 def _trails_or_spots(
     scene: _Scene,
-    found: tuple[Indices32, Grid, Table],
+    objects: tuple[Indices32, Grid, Table],
     fits: _Fits,
     shape: SpotShape,
     turning: SpotShape | None,
@@ -560,12 +560,12 @@ def _trails_or_spots(
 
     Parameters
     ----------
-    found : (peaks, heights, hot pixels)
+    objects : (peaks, heights, hot pixels)
         From `_without_hot_pixels`.
     turning : SpotShape or None
         The shape by the brightest stars, if that has trails.
     """
-    peaks, heights, hot = found
+    peaks, heights, hot = objects
     height, width = scene.counts.shape
     most_are_hot = len(hot) > len(peaks)
     bright = np.ones(len(peaks), dtype=np.bool_)

@@ -424,24 +424,24 @@ class Pipeline:
         places = self._predicted_places(predicted, request, stars)
         if len(places) < least:
             return detections, failed
-        image, known = self._detection(exposure, request, sensor)
+        image, usual = self._detection(exposure, request, sensor)
         faint = replace(
-            known,
-            threshold_sigma=min(_TRACKED_SIGMA, known.threshold_sigma),
+            usual,
+            threshold_sigma=min(_TRACKED_SIGMA, usual.threshold_sigma),
             min_star_pixels=0,
             psf_sigma_px=sensor.mean_psf_sigma_px,
         )
-        seen, rivals, searched = detect_near(image, places, _window_px(settings), faint)
+        in_windows, rivals, searched = detect_near(image, places, _window_px(settings), faint)
         solution = solve_with_prediction(
-            camera, stars, seen, Prediction(predicted, covariance, request.prediction_freedom),
+            camera, stars, in_windows, Prediction(predicted, covariance, request.prediction_freedom),
             2.5 * log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY, self._largest_error_deg,
             wrong_predictions=self._setup.device["wrong_predictions"], rivals=rivals, searched=searched,
-            observer_velocity=request.observer_velocity, known=self._calibration,
+            observer_velocity=request.observer_velocity, camera_covariance=self._calibration,
         )  # fmt: skip
         if not solution.valid or solution.star_count < least:
             return detections, rejected(failed, Reason.PREDICTION_LOST) if failed.valid else failed
         rows = identifier.catalog.index_of(solution.hip).astype(np.int64)
-        return seen, replace(solution, catalog_index=rows)
+        return in_windows, replace(solution, catalog_index=rows)
 
     def _detect_predicted(
         self, exposure: _Exposure, request: FrameRequest, sensor: SensorModel
