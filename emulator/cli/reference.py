@@ -255,7 +255,6 @@ def truth() -> str:
 
 
 def orbit() -> str:
-    """The ways to give an orbit."""
     from starhil.emulator.truth.config import OrbitConfig
 
     return "\n\n".join(alternatives(OrbitConfig, "`kind"))
@@ -273,7 +272,6 @@ def alternatives(annotation: Any, key: str) -> Iterator[str]:
 
 
 def described(title: str, model: type[BaseModel]) -> str:
-    """Return the section of a model."""
     return f"### {title}\n\n{plain_text(model.__doc__ or '')}\n\n{table(model_rows(model))}"
 
 
@@ -377,7 +375,6 @@ def faults() -> str:
 
 
 def scenario() -> str:
-    """Keys of an event of a scenario."""
     from starhil.emulator.control.scenario import ScenarioEvent
 
     return table(model_rows(ScenarioEvent))
@@ -530,7 +527,6 @@ def actions() -> str:
 
 
 def device_parameters() -> str:
-    """Every parameter of the device model."""
     from starhil.protocol.icd.device_model import device_model
 
     rows: list[Row] = [
@@ -580,7 +576,6 @@ def each_command() -> Iterator[tuple[str, Any]]:
 
 
 def command_part(name: str, command: Any) -> str:
-    """Return the section of a command."""
     shown = [parameter for parameter in command.params if not getattr(parameter, "hidden", False)]
     arguments = [parameter for parameter in shown if parameter.param_type_name == "argument"]
     usage = " ".join([name, *("[options]",), *(argument_usage(item) for item in arguments)])
@@ -590,7 +585,6 @@ def command_part(name: str, command: Any) -> str:
 
 
 def argument_usage(parameter: Any) -> str:
-    """Format an argument for a usage line."""
     name = argument_name(parameter) + ("…" if parameter.nargs == -1 else "")
     return name if parameter.required else f"[{name}]"
 
@@ -601,7 +595,6 @@ def argument_name(parameter: Any) -> str:
 
 
 def option_row(parameter: Any) -> str:
-    """Return the row of an argument or option."""
     argument = parameter.param_type_name == "argument"
     names = [argument_name(parameter)] if argument else [*parameter.opts, *parameter.secondary_opts]
     value = "required" if parameter.required else shown_default(parameter.default)

@@ -56,7 +56,6 @@ class Reported:
 
     @property
     def valid(self) -> bool:
-        """Whether the attitude is valid."""
         return self.reason == "ok"
 
     @property

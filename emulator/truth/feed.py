@@ -169,7 +169,6 @@ class _Datagrams:
             self._feed.truth.reject("messages come too fast; the oldest are dropped")
 
     def process_line(self) -> None:
-        """Process the next line."""
         line = self._waiting[0].pop()
         self.waiting -= 1
         if not self._waiting[0]:

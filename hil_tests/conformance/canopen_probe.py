@@ -388,7 +388,6 @@ class CanopenProbe(Probe):
     # States
 
     def nmt(self, specifier: int, node: int | None = None) -> None:
-        """Send an NMT command."""
         self.send(NMT, bytes([specifier, self.node if node is None else node]))
 
     def state(self) -> int:

@@ -91,7 +91,6 @@ def _is_unjudged(outcome: Outcome) -> bool:
 
 
 def write_junit_report(path: Path, outcomes: Sequence[Outcome]) -> None:
-    """Write a JUnit XML file."""
     cases = [
         TestCase(
             outcome.area,

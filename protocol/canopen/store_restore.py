@@ -33,7 +33,6 @@ Background: TypeAlias = Callable[[Callable[[], None], Ended], None]
 
 
 def write_at_once(work: Callable[[], None], ended: Ended) -> None:
-    """Perform a write, and wait for it."""
     try:
         work()
     except StorageError as error:

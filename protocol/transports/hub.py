@@ -156,7 +156,6 @@ class _Client(asyncio.Protocol):
         self._write_waiting()
 
     def data_received(self, data: bytes) -> None:
-        """Process commands."""
         self._end_settling()
         self._error_answered = False
         frames: list[CanFrame] = []

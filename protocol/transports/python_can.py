@@ -265,7 +265,6 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         await self._idle.wait()
 
     async def close(self) -> None:
-        """Leave the bus."""
         await super().close()
         thread, self._thread = self._thread, None
         if thread is not None:

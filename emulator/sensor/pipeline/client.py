@@ -181,7 +181,6 @@ class WorkerClient:
             self.ended.emit(text)
 
     async def close(self) -> None:
-        """End the worker and wait for it."""
         self._closing = True
         self._disconnect()
         if self._task is not None:

@@ -117,7 +117,6 @@ class FrameGrid:
 
 @inner_checked
 def cell_row(row_start: Indices, cell: int) -> int:
-    """Find the row of a cell by bisection."""
     low = 0
     high = row_start.size - 1
     while high - low > 1:

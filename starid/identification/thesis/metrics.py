@@ -63,7 +63,6 @@ class Confusion:
 
     @classmethod
     def of(cls, taken_for_true: Mask, is_star: Mask) -> Confusion:
-        """Count one frame."""
         taken = (taken_for_true, ~taken_for_true)
         return cls(*(int(np.count_nonzero(a & b)) for a in taken for b in (is_star, ~is_star)))
 

@@ -126,7 +126,6 @@ def _section(finished: FinishedExperiment) -> list[str]:
 
 
 def report_text(results: Sequence[FinishedExperiment], *, quick: bool, seed: int) -> str:
-    """Format the report in Markdown."""
     missed = [(name, row) for name, row in _named_rows(results) if row.passed is False]
     lost = regressions(results)
     lines = [Path(__file__).with_name("notes").joinpath("report.md").read_text(encoding="utf-8")]

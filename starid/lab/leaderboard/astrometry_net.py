@@ -33,12 +33,10 @@ _PROBES: Final = 3
 
 
 def installed() -> bool:
-    """Return whether the program is on the path."""
     return shutil.which(PROGRAM) is not None
 
 
 def version() -> str:
-    """Return the version that the program prints."""
     answer = subprocess.run([PROGRAM, "--version"], capture_output=True, text=True, check=False)  # noqa: S603
     words = (answer.stdout + answer.stderr).replace(",", " ").split()
     return next((word for word in words if word[:1].isdigit()), "unknown")
@@ -104,7 +102,6 @@ def star_table(xy_px: NDArray[np.float64], flux: NDArray[np.float64], camera: Ca
 
 
 def read_header(content: bytes) -> dict[str, float]:
-    """Return the numbers in a FITS header."""
     numbers: dict[str, float] = {}
     for start in range(0, len(content), _CARD):
         card = content[start : start + _CARD].decode("ascii", "replace")

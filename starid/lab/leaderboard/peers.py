@@ -172,7 +172,6 @@ def make_solver(name: str, camera: Camera, stars: StarCatalog, *, raw: bool = Fa
 
 
 def version_of(name: str) -> str:
-    """Version of an installed solver."""
     if ":" in name:
         return "custom"
     if name == "solve-field":
