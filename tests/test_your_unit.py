@@ -25,12 +25,11 @@ STREAMING = "A unit that streams by itself"
 PYTHON = "A framing in Python"
 
 
-def written(folder):
-    """Write the unit of the page into a folder."""
+def written(folder, streams_by_itself=False):
+    """Write the unit of the page into a folder, or that which measures from power-on and streams a selected row."""
     folder.mkdir()
-    text = "\n".join(
-        block.text for block in blocks(PAGE) if block.language == "toml" and block.heading != STREAMING
-    )
+    tables = [block for block in blocks(PAGE) if block.language == "toml"]
+    text = "\n".join(block.text for block in tables if streams_by_itself or block.heading != STREAMING)
     (folder / "unit.toml").write_text(text, encoding="utf-8")
     return folder
 

@@ -23,6 +23,7 @@ from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
     INVALID_PARAMETER,
+    UNSOLICITED_PARAMETERS,
     LinkProbe,
     changes_link,
     checked_values,
@@ -447,7 +448,7 @@ def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
         offered = [
             item
             for item in unit.telemetry.values()
-            if message_class in ("", item.message_class) and item.unsolicited is None
+            if message_class in ("", item.message_class) and not _is_sent_always(item, unit)
         ][:2]
         if row.action == "subscribe" and fields and offered:
             title = f"{row.name} starts and stops unsolicited telemetry"
@@ -461,9 +462,16 @@ def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
             )
 
 
+def _is_sent_always(row: Row, unit: Unit) -> bool:
+    """Return whether a unit sends a row without a request in its default state: at a rate, at events, or selected by parameters."""
+    defaults = {name: unit.device_parameters[name].default for name in UNSOLICITED_PARAMETERS}
+    selected = bool(defaults["unsolicited_rate"]) and row.id == defaults["unsolicited_selection"]
+    return row.unsolicited is not None or selected
+
+
 def _subscribed(command: Row, fields: list[str], offered: list[Row], probe: LinkProbe) -> None:
     _check_carried(probe)
-    with probe.streaming(offered):
+    with identifying_stars(probe), probe.streaming(offered):  # rows may be sent at each measurement only
         _subscribe(command, fields, offered, probe)
 
 
@@ -474,11 +482,8 @@ def _subscribe(command: Row, fields: list[str], offered: list[Row], probe: LinkP
         """Return the messages that the list has caused, not those that the unit always sends."""
         answers = probe.receive_unsolicited(seconds)
         probe.check_numbers(answers)
-        always = {
-            (row.id, row.message_class)
-            for row in probe.unit.telemetry.values()
-            if row.unsolicited is not None
-        }
+        rows = probe.unit.telemetry.values()
+        always = {(row.id, row.message_class) for row in rows if _is_sent_always(row, probe.unit)}
         return [answer for answer in answers if (answer.row_id, answer.message_class) not in always]
 
     chosen = none | {name: row.id for name, row in zip(fields, offered, strict=False)}

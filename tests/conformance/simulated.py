@@ -176,8 +176,8 @@ class SimulatedUnit:
     """A device in simulated time, with one link and a probe on it; a context manager.
 
     `damage` is called with the unit before the device is switched on: it is how mutants are made. Another way is to
-    have the device serve another definition than that of the tester: a folder, in `served`. `parameters` are those of the profile; by
-    default, any unit but the CubeStar identifies stars from the start.
+    have the device serve another definition than that of the tester: a folder, in `served`. `parameters` are those of the profile; the
+    others have the unit's defaults, as of `starhil conformance --start`.
     """
 
     def __init__(
@@ -196,8 +196,7 @@ class SimulatedUnit:
         self.icd = load_unit(unit)
         self._served = self.icd if served is None else load_unit(served)
         self._damage = damage
-        starts = unit != DEFAULT_UNIT and link != "canopen"
-        self._parameters = parameters or ({"start_mode": "lost_in_space"} if starts else {})
+        self._parameters = parameters or {}
 
     def __enter__(self) -> Self:
         asyncio.set_event_loop(self.loop)

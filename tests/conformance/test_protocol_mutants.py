@@ -78,8 +78,9 @@ def messages(unit: Path) -> list[object]:
         return [str(error)]
 
 
-def test_the_unit_of_the_tutorial_passes_every_case(tmp_path: Path) -> None:
-    results = list(outcomes(unit_of("tutorial", tmp_path / "lynx")))
+@pytest.mark.parametrize("streams_by_itself", [False, True])
+def test_the_unit_of_the_tutorial_passes_every_case(streams_by_itself: bool, tmp_path: Path) -> None:
+    results = list(outcomes(written(tmp_path / "lynx", streams_by_itself)))
     assert [
         (o.id, o.expected, o.seen) for o in results if o.status != "passed" and ".unjudged." not in o.id
     ] == []
