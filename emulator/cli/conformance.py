@@ -168,10 +168,10 @@ def command(
         for item in requested:
             kind = "intrusive" if item.intrusive else "safe"
             print(f"{item.id}\t{kind}\t{item.title}\t{item.clause}")
-    if left_out:
-        notice = Console(stderr=True, highlight=False) if list_only else console
-        notice.print(left_out_text(left_out, [*requested, *left_out]), soft_wrap=True)
+    notice = left_out_text(left_out, [*requested, *left_out]) if left_out else ""
     if list_only:
+        if notice:
+            print(notice, file=sys.stderr)
         return
     for path in (junit, html):
         if path is not None:
@@ -200,6 +200,8 @@ def command(
         print()
     else:
         report.print_summary(console, outcomes)
+        if notice:
+            console.print(notice, style="bold yellow", soft_wrap=True)
     if result.interruption is not None:
         raise typer.Exit(result.interruption.exit_status)
     raise typer.Exit(1 if report.count(outcomes, "failed") else 0)

@@ -94,9 +94,9 @@ def run_session(request: SessionRequest) -> SessionResult:
     console = Console(highlight=False, quiet=request.quiet)
     console.print(Text(escape_controls(script.title), style="bold"))
     if not request.start and request.control is None and _asks_for_an_emulator(script):
-        hint = "for an emulator as --start makes it, or this command, which --control ADDRESS checks: "
+        hint = "This session expects the emulator that --start makes (--control ADDRESS checks it). To make it by hand: "
         hint += start_command(script, folder)
-        console.print(Text(escape_controls(hint), style="dim"), soft_wrap=True)
+        console.print(Text(escape_controls(hint), style="yellow"), soft_wrap=True)
     show: Callable[[StepResult], None] = partial(_print_result, console)
     result: SessionResult | None = None
     try:
