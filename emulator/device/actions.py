@@ -81,6 +81,7 @@ def open_image(device: Device, arguments: Arguments) -> PendingAnswer[ErrorCode]
 
 
 def load_image_chunk(device: Device, arguments: Arguments) -> None:
+    """Load a chunk of the open image."""
     images, number = device.images.state, int(arguments["number"])
     if images.busy and images.download is None:
         raise Refused(ErrorCode.BUSY)
@@ -92,6 +93,7 @@ def load_image_chunk(device: Device, arguments: Arguments) -> None:
 
 
 def save_image(device: Device, arguments: Arguments) -> None:
+    """Capture an image and store it."""
     if arguments["camera"] != "star":
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="camera")
     if device.modes.mode in {Mode.BOOT, Mode.ERROR}:
@@ -109,11 +111,13 @@ def convert_image(device: Device, arguments: Arguments) -> None:
 
 
 def set_mode(device: Device, arguments: Arguments) -> None:
+    """Change the mode."""
     if not device.command_mode(Mode(str(arguments["mode"]))):
         raise Refused(ErrorCode.SEQUENCE)
 
 
 def set_parameter(device: Device, arguments: Arguments) -> None:
+    """Set one parameter and select it."""
     parameter = device.icd.parameters_by_id.get(int(arguments["parameter"]))
     if parameter is None:
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="parameter")
@@ -138,14 +142,17 @@ def save_parameters(device: Device, _arguments: Arguments) -> PendingAnswer[Erro
 
 
 def restore_parameters(device: Device, _arguments: Arguments) -> None:
+    """Load the stored parameters."""
     device.restore_parameters()
 
 
 def default_parameters(device: Device, _arguments: Arguments) -> None:
+    """Set all parameters to their defaults."""
     device.parameters.set_defaults()
 
 
 def clear_counters(device: Device, _arguments: Arguments) -> None:
+    """Clear the counters and flags of the links."""
     device.counters = Counters()
 
 
@@ -172,14 +179,17 @@ def select_unsolicited(device: Device, arguments: Arguments) -> None:
 
 
 def rewind_file_list(device: Device, _arguments: Arguments) -> None:
+    """Go to the first file of the list."""
     device.files.rewind()
 
 
 def advance_file_list(device: Device, _arguments: Arguments) -> None:
+    """Go to the next file of the list."""
     device.files.advance()
 
 
 def erase_file(device: Device, arguments: Arguments) -> None:
+    """Erase one file or all."""
     if arguments["all"]:
         device.files.erase_all(formatting=False)
     elif not device.files.erase(str(arguments["file_type"]), int(arguments["file_counter"])):
@@ -187,10 +197,12 @@ def erase_file(device: Device, arguments: Arguments) -> None:
 
 
 def format_card(device: Device, _arguments: Arguments) -> None:
+    """Erase all files."""
     device.files.erase_all(formatting=True)
 
 
 def load_file_block(device: Device, arguments: Arguments) -> None:
+    """Load a block of a file."""
     offset, length = int(arguments["offset"]), int(arguments["length"])
     if not device.files.load(str(arguments["file_type"]), int(arguments["file_counter"]), offset, length):
         raise Refused(ErrorCode.INVALID_PARAMETER)

@@ -56,6 +56,7 @@ class Reported:
 
     @property
     def valid(self) -> bool:
+        """Whether the attitude is valid."""
         return self.reason == "ok"
 
     @property

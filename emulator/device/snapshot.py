@@ -132,6 +132,7 @@ class Snapshot:
 
     @once
     def erasing(self) -> bool:
+        """Whether all files are being erased."""
         return self.now_ns < self.files.erased_ns
 
     @once
@@ -158,4 +159,5 @@ class Snapshot:
 
     @once
     def phase(self) -> Phase:
+        """The phase of the frame cycle."""
         return self.constants.power.phase(self.timing, self.now_ns)

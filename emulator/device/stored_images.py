@@ -54,6 +54,7 @@ class StoredImage:
 
     @cached_property
     def file_crc(self) -> int:
+        """Checksum of the file."""
         return file_checksum(self.content())
 
     def content(self) -> bytes:
