@@ -47,7 +47,10 @@ _PLAIN: Final = {
 _HANDLER: Final = "starhil-plain"
 
 PROGRESS_S: Final = 5.0
-"""Time after which the progress of compiling is reported, and between reports, seconds."""
+"""Time after which the progress of compiling is reported, and between reports on a terminal, seconds."""
+
+LOG_S: Final = 30.0
+"""Time between reports if stderr is no terminal, so that they do not fill a log, seconds."""
 
 COMPILED_S: Final = 120.0
 """Time without a new kernel after which the cache is no longer searched for more, as that would disturb a benchmark, seconds."""
@@ -67,16 +70,18 @@ def compiling_reported(*, start: bool = False) -> Iterator[None]:
             return
         from starid.storage import cache
 
-        written, compiled, grown_s = 0, "", begin_s
+        written, reported, compiled, grown_s, due_s = 0, 0, "", begin_s, begin_s
         while True:
             before, written = written, cache.kernels_written_since(begin_unix_s)
+            now_s = time.monotonic()
             if written > before:
-                grown_s = time.monotonic()
+                grown_s = now_s
                 compiled = f", kernels added to the cache: {written}; later runs use them"
-            if start or written > before:
+            if now_s >= due_s and (start or written > reported):
                 what = "starting" if start else "compiling"
-                print(f"{what}: {time.monotonic() - begin_s:.0f} s{compiled}", file=sys.stderr, flush=True)
-            done = not start and time.monotonic() - grown_s > COMPILED_S
+                print(f"{what}: {now_s - begin_s:.0f} s{compiled}", file=sys.stderr, flush=True)
+                reported, due_s = written, now_s + (0.0 if sys.stderr.isatty() else LOG_S)
+            done = not start and now_s - grown_s > COMPILED_S
             if done or ended.wait(PROGRESS_S):
                 return
 

@@ -183,6 +183,7 @@ def slow_worker(worker: Callable[..., object], monkeypatch: pytest.MonkeyPatch, 
     worker(WORKER + waits + "send(Failure('no catalogue'))\n")
     monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr("starid.cli.output.PROGRESS_S", 0.05)
+    monkeypatch.setattr("starid.cli.output.LOG_S", 0.0)
     return gate
 
 
@@ -223,6 +224,7 @@ def test_what_a_command_compiles_is_reported(
             return 2
 
     monkeypatch.setattr("starid.cli.output.PROGRESS_S", 0.001)
+    monkeypatch.setattr("starid.cli.output.LOG_S", 0.0)
     monkeypatch.setattr("starid.storage.cache.kernels_written_since", written_since)
     assert output.compiles(counted.wait)(PATIENCE_S)
     lines = (

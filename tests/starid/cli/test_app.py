@@ -150,8 +150,14 @@ def test_an_extra_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: py
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("start", [False, True])
-def test_compiling_is_reported_while_the_number_of_kernels_grows(monkeypatch, capsys, start):
+@pytest.mark.parametrize(
+    ("start", "terminal", "reported"),
+    [(False, True, [2, 5]), (True, True, [0, 2, 2, 5]), (False, False, [2]), (True, False, [0])],
+)
+def test_compiling_is_reported_while_the_number_of_kernels_grows_and_in_a_log_less_often(
+    monkeypatch, capsys, start, terminal, reported
+):
+    """Minutes of compiling filled the logs of CI with a line every 5 s."""
     written = iter((0, 2, 2, 5))
     counted = threading.Event()
 
@@ -165,11 +171,14 @@ def test_compiling_is_reported_while_the_number_of_kernels_grows(monkeypatch, ca
 
     monkeypatch.setattr("starid.storage.cache.kernels_written_since", written_since)
     monkeypatch.setattr(output, "PROGRESS_S", 0.001)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     with output.compiling_reported(start=start):
         assert counted.wait(PATIENCE_S)
-    done = [f", kernels added to the cache: {number}; later runs use them" for number in (2, 5)]
-    expected = ["", done[0], done[0], done[1]] if start else done
-    lines = [rf"{'starting' if start else 'compiling'}: \d+ s{line}\n" for line in expected]
+    done = {
+        0: "",
+        **{number: f", kernels added to the cache: {number}; later runs use them" for number in (2, 5)},
+    }
+    lines = [rf"{'starting' if start else 'compiling'}: \d+ s{done[number]}\n" for number in reported]
     assert re.fullmatch("".join(lines), capsys.readouterr().err)
 
 
