@@ -9,6 +9,7 @@ import struct
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -360,6 +361,16 @@ def test_a_member_is_a_double_only_if_a_float_would_round_its_steps(name: str) -
                 assert roundings < 256 if double else roundings > 32, (row.name, field.name)
                 counts[double] += 1
     assert counts[False] > 50
+
+
+@pytest.mark.parametrize("name", ["cubestar", "st16", "cubestar-gen2"])
+def test_the_introduction_of_the_header_breaks_lines_only_where_they_are_full(name: str) -> None:
+    unit = load_unit(name)
+    introduction = render_folder(unit)[f"{prefix_of(unit)}.h"].partition(" */")[0]
+    for paragraph in re.split(r"\n \*\n", introduction.removeprefix("/* ")):
+        lines = paragraph.removeprefix(" * ").split("\n * ")
+        for line, following in pairwise(lines):
+            assert len(f"{line} {following.split()[0]}") > 100
 
 
 def test_the_header_has_version_and_checksum_of_the_definition() -> None:
