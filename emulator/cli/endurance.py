@@ -298,7 +298,7 @@ def _print(figures: dict[str, Any], outcomes: list[dict[str, Any]]) -> None:
     Console().print(table)
     print(
         f"Years under power, and taking images. Seed {figures['seed']}; {figures['cpu_hours']:.2f} h of processor time, "
-        f"device time : processor time {figures['factor']:.0f}"
+        f"each second of which simulated {figures['factor']:.0f} s"
     )
     for item in outcomes:
         if item["violation"]:

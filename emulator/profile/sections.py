@@ -287,7 +287,7 @@ class SerialConfig(Strict):
     port: str = "auto"
     """`auto` (a pty), a device path, `listen://HOST:PORT`, or `off`."""
     dialect: Literal["a", "b", "c"] = "b"
-    """Format of replies: `a` for a CubeComputer, `b` for a stand-alone node, `c` for generation 2."""
+    """Format of replies: [which one an OBC expects](icd/cubestar.md#serial-line)."""
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115_200
     """Bit rate."""
     pace: bool = True
