@@ -182,7 +182,7 @@ def test_every_start_of_an_emulator_is_accepted(folder, monkeypatch):
     """Its files, keys and combinations of options are valid; no emulator is made."""
     accepted = []
 
-    async def serve(make, _algorithms):
+    async def serve(make):
         accepted.append(make)
         return 0
 
