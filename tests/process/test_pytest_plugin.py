@@ -16,6 +16,7 @@ pytestmark = pytest.mark.process
 
 ROOT = Path(__file__).resolve().parents[2]
 (PAGE_TESTS,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/pytest.md").read_text(), re.DOTALL)
+README_TEST, _ = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
 COUNT = PAGE_TESTS.count("def test_")
 
 
@@ -29,6 +30,10 @@ def run_pytest(folder: Path, programs: str | dict[str, str], *options: str) -> s
         command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     return done.stdout + done.stderr
+
+
+def test_the_example_of_the_readme_passes(tmp_path):
+    assert "1 passed" in run_pytest(tmp_path, README_TEST)
 
 
 def test_what_a_unit_on_a_serial_line_lacks_is_skipped_by_name(tmp_path):
