@@ -267,6 +267,9 @@ class UnitUnderTest:
         sent.clear()
         return taken
 
+    def is_late(self, link: str) -> bool:
+        return self.head.links[link].wire.holds
+
     # --- surroundings ---
 
     async def set_truth(self, truth: Mapping[str, Any]) -> None:

@@ -82,6 +82,11 @@ class WireFaults(Generic[Item]):
         self._free_ns = 0
         self._release_scheduled = False
 
+    @property
+    def holds(self) -> bool:
+        """Whether delayed items have not been sent yet."""
+        return bool(self._held)
+
     def send(self, item: Item) -> None:
         """Send an item, subject to the current faults."""
         settings, rng = self.settings, self._rng

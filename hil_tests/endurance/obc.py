@@ -15,6 +15,7 @@ from starhil.hil_tests.endurance.life import ADDRESSES, Outcome
 from starhil.hil_tests.endurance.node import Node
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.ports import CanopenPort, CanPort, Port, SerialPort, objects_of
+from starhil.hil_tests.endurance.streams import Streams
 from starhil.hil_tests.endurance.unit import LiveUnit
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import Unit
@@ -42,6 +43,11 @@ class Obc:
         self._objects = {} if definition.canopen is None else objects_of(definition)
         self._node = None if definition.canopen is None else Node(definition)
         self._ports: dict[str, Port] = {}
+        self._streams = Streams(definition)
+        self._unasked: list[tuple[float, str, Answer]] = []
+        """What came with the answers to requests, to be judged once these have been: it follows from them."""
+        self._sent_by: dict[tuple[float, str, bytes], str] = {}
+        """First link on which a row was sent without a request, with these data, at this instant."""
 
     def connect(self) -> None:
         """Make the end of each link, for the address or format in use."""
@@ -54,6 +60,7 @@ class Obc:
                 if parameter.id:
                     self._oracle.disturbed.add(link)  # until the unit is restored
             self._ports[link] = self._port(link, in_use)
+            self._streams.begin(link, self._unit.now_s)
 
     def _port(self, link: str, address: Value) -> Port:
         deliver, take = partial(self._unit.deliver, link), partial(self._unit.take, link)
@@ -75,6 +82,7 @@ class Obc:
         """Wait until the unit has dropped what is incomplete, and begin a link again."""
         await self._unit.step(TIME_OUT_S)
         self._unit.take(link)
+        self._streams.begin(link, self._unit.now_s)
         self.hear()
         self._oracle.time_passed(self._unit.now_s)
         self.connect()
@@ -83,7 +91,8 @@ class Obc:
 
     def hear(self) -> None:
         """Judge the messages that no request has caused, in order of time."""
-        messages: list[tuple[float, str, Answer | CanFrame]] = []
+        messages: list[tuple[float, str, Answer | CanFrame]] = [*self._unasked]
+        self._unasked.clear()
         for link in self._unit.links:
             port = self._ports[link]
             messages += [(at_s, link, event) for at_s, event in port.answers()]
@@ -92,10 +101,22 @@ class Obc:
         for at_s, link, event in sorted(messages, key=lambda item: item[0]):
             if at_s > self._oracle.now_s:
                 self._end_instant()
+                self._sent_by.clear()
             if link not in self._oracle.disturbed:
                 self._oracle.time_passed(at_s)
                 self._judge_unasked(link, event)
         self._end_instant()
+        for link in self._unit.links:
+            if self._oracle.stuck or link in self._oracle.disturbed:
+                self._streams.begin(link, self._unit.now_s)
+            elif self._has_unsolicited(link):
+                self._streams.passed(link, self._unit.now_s)
+
+    def _has_unsolicited(self, link: str) -> bool:
+        port = self._ports[link]
+        return (
+            port.line.envelope.has_unsolicited if isinstance(port, SerialPort) else isinstance(port, CanPort)
+        )
 
     def _end_instant(self) -> None:
         if self._node is not None:
@@ -121,10 +142,14 @@ class Obc:
         host = self._oracle.in_use("host_address")
         if link == "can" and host not in (None, event.other):
             raise Violation(f"{link}: {event} to address {event.other}, not {host!r}")
-        if not self._oracle.streams:
-            raise Violation(f"{link}: {row.name} without a subscription")
-        self._outcome.readings += 1
-        self._oracle.read(row, event.data)
+        subscribed = self._oracle.is_subscribed(row)
+        if not subscribed and not self._oracle.may_send(row):
+            raise Violation(f"{link}: {row.name} without a subscription or an event")
+        self._streams.received(link, row, self._oracle.now_s, subscribed=subscribed)
+        sent = (self._oracle.now_s, row.name, event.data)
+        if self._sent_by.setdefault(sent, link) == link:  # not read on another link already
+            self._outcome.readings += 1
+            self._oracle.read_unasked(row, event.data)
 
     # --- requests ---
 
@@ -174,13 +199,13 @@ class Obc:
         await self.settle(link)
 
     def _answers(self, link: str) -> list[Answer]:
-        """Return the answers on a link; packets of files that follow them are judged separately."""
+        """Return the answers on a link; what else has come is put aside."""
         answers: list[Answer] = []
-        for _, event in self._ports[link].answers():
+        for at_s, event in self._ports[link].answers():
             if event.kind not in ("unsolicited", "burst"):
                 answers.append(event)
-            elif link not in self._oracle.disturbed:
-                self._judge_unasked(link, event)
+            else:
+                self._unasked.append((at_s, link, event))
         return answers
 
     async def _judge(
@@ -264,6 +289,7 @@ class Obc:
             await self._unit.step(TURN_S)
             for link in self._unit.links:
                 self._unit.take(link)  # of the time before the restart, or of the boot
+            self._unasked.clear()
             oracle.restarted(start_s)
             oracle.time_passed(self._unit.now_s)
             self.connect()
@@ -308,6 +334,7 @@ class Obc:
             if self._oracle.stuck or link in self._oracle.disturbed:
                 return
             await self.request(link, row, data)
+            self.hear()
 
     async def cut(self, link: str, row: Sequence[Any], share: float) -> None:
         """Send the first part of a request, as a client that disconnects does; on a bus it must not be answered."""

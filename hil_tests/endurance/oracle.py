@@ -127,7 +127,9 @@ class Oracle:
         self._frames = None
         self._selected = next(iter(self._definition.parameters_by_id), None)
         self._last = None
-        self.bursts = self._subscribed = False
+        self.bursts = False
+        self._subscribed: frozenset[tuple[str | None, int]] | None = frozenset()
+        """Class, if it is given, and ID of the rows of the last subscription; None if it is not known."""
         self.attitudes.started(at_s)
 
     def time_passed(self, now_s: float) -> None:
@@ -217,7 +219,8 @@ class Oracle:
         self.counts = dict.fromkeys(self.counts)
         self._clock = self._boot_count = self._selected = self._last = self._started_s = None
         self.modes = set(self._definition.modes)
-        self.bursts = self._subscribed = True
+        self.bursts = True
+        self._subscribed = None
         self.attitudes.retimed(self.now_s)
 
     def in_use(self, name: str) -> Value | None:
@@ -233,8 +236,7 @@ class Oracle:
         if row is None or row.only_sent:
             return "invalid_id"
         if request.telemetry:
-            images = any((field.value or "").startswith(("image.", "file.")) for field in row.named.values())
-            return "invalid_length" if data else None if images else "ok"
+            return "invalid_length" if data else None if row.carries_files else "ok"
         if not row.has_length(data):
             return "invalid_length"
         if self.is_outside(row, data):
@@ -322,7 +324,10 @@ class Oracle:
             case "start_burst":
                 self.bursts = True
             case "subscribe":
-                self._subscribed = True
+                self._subscribed = frozenset(
+                    (arguments.get("class"), int(value))
+                    for name, value in arguments.items() if name.startswith("telemetry[")
+                )  # fmt: skip
             case action if action not in _INERT_ACTIONS:
                 self.forget()
 
@@ -354,11 +359,36 @@ class Oracle:
             )
             self._clock = (self.now_s, total + self._definition.conventions.epoch_ns)
 
-    @property
-    def streams(self) -> bool:
-        """Whether telemetry may come without a request."""
-        rate = self.values.get("unsolicited_rate")
-        return self._subscribed or rate is None or float(rate[0]) > 0.0
+    # --- telemetry without a request ---
+
+    def is_subscribed(self, row: Row) -> bool:
+        """Return whether a telecommand, or the parameters, may have selected a row to be sent without a request."""
+        if self._subscribed is None or not self._subscribed.isdisjoint(
+            ((None, row.id), (row.message_class, row.id))
+        ):
+            return True
+        rate, selection = self.values["unsolicited_rate"], self.values["unsolicited_selection"]
+        is_selected = selection is None or int(selection[0]) == row.id
+        return is_selected and (rate is None or float(rate[0]) > 0.0)
+
+    def may_send(self, row: Row) -> bool:
+        """Return whether the definition may send a row now: at a rate, or after an event that is possible in this mode."""
+        if row.unsolicited is None or isinstance(row.unsolicited, float):
+            return row.unsolicited is not None
+        return any(self.modes & _EVENT_MODES.get(event, self.modes) for event in row.unsolicited)
+
+    def read_unasked(self, row: Row, data: bytes) -> None:
+        """Judge the telemetry of a row that no request has caused; a boot that ends passes through standby."""
+        after_boot = self.modes - {"boot"} if "boot" in self.modes else None
+        if (
+            after_boot is not None
+            and not isinstance(row.unsolicited, float)
+            and "mode" in (row.unsolicited or ())
+        ):
+            self.modes = self.modes | {"standby"}
+        self.read(row, data)
+        if after_boot is not None and self.modes == {"standby"}:
+            self.modes = self.modes | after_boot
 
     # --- readings ---
 
@@ -527,6 +557,8 @@ class Oracle:
 
 _COMMANDABLE_MODES: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
 """Modes that can be commanded from a mode; from all others, any but boot and error (docs/rules.md, R13)."""
+_EVENT_MODES: Final[dict[str, frozenset[str]]] = {"error": frozenset({"error"}), "frame": IMAGING}
+"""Modes in which an event is possible; all others are in any."""
 _TIMING: Final = frozenset({"update_rate", "exposure", "delay_time"})
 _ORBIT: Final = frozenset({"orbit_semi_major_axis", "orbit_eccentricity"})
 _BOUND: Final = _TIMING | _ORBIT | {"min_star_pixels", "max_star_pixels"}

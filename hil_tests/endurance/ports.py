@@ -27,6 +27,8 @@ class SerialPort:
     def __init__(self, unit: Unit, deliver: Deliver, take: Take, dialect: str | None) -> None:
         self._deliver, self._take = deliver, take
         self.line = SerialLine(unit, dialect)
+        # any row may be subscribed to, and the oracle judges whether it was
+        self.line.streamed = {(row.message_class, row.id) for row in unit.telemetry.values()}
 
     def ask(self, *requests: Request) -> None:
         """Send requests in one piece."""

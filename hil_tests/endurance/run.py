@@ -13,6 +13,8 @@ from starhil.hil_tests.endurance.unit import LiveUnit
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import Unit
 
+DELAYED_S: Final = 10.0
+"""Steps in which output that faults have delayed is awaited once they have ended, seconds."""
 ORION: Final = {"kind": "fixed", "attitude": {"ra_deg": 83.8, "dec_deg": -1.2, "roll_deg": 0.0}}
 
 
@@ -115,7 +117,9 @@ class LifeRun:
         oracle = self._oracle
         oracle.faults_ended(self._unit.now_s)
         if oracle.disturbed:
-            await self._unit.step(10.0)  # delayed output arrives
+            await self._unit.step(DELAYED_S)
+            while any(self._unit.is_late(link) for link in oracle.disturbed):
+                await self._unit.step(DELAYED_S)
             for link in oracle.disturbed:
                 self._unit.take(link)
             self._obc.hear()

@@ -40,6 +40,9 @@ class LiveUnit(Protocol):
     def take(self, link: str) -> list[tuple[float, Any]]:
         """Return what the unit has sent, and when, seconds."""
 
+    def is_late(self, link: str) -> bool:
+        """Return whether output on a link that faults have delayed has still to come."""
+
     async def set_truth(self, truth: Mapping[str, Any]) -> None:
         """Replace the truth."""
 

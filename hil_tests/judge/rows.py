@@ -326,6 +326,11 @@ class Row:
         """Whether the unit sends the row regularly: at a rate, or with each measurement."""
         return isinstance(self.unsolicited, float) or "frame" in (self.unsolicited or ())
 
+    @property
+    def carries_files(self) -> bool:
+        """Whether the row reports images or files, which cannot be read at all times."""
+        return any((item.value or "").startswith(("image.", "file.")) for item in self.named.values())
+
     def example(self) -> dict[str, Value]:
         return {name: item.plain for name, item in self.named.items()}
 

@@ -277,14 +277,14 @@ def test_an_update_rate_that_is_not_used_is_found(monkeypatch):
 
 
 def test_telemetry_that_nobody_has_subscribed_to_is_found(monkeypatch):
-    monkeypatch.setattr(Oracle, "streams", False)
+    monkeypatch.setattr(Oracle, "is_subscribed", lambda *_: False)
     row = next(
         row for row in load_unit("cubestar").telecommands.values() if row.action == "select_unsolicited"
     )
     data = row.encode({"telemetry": 160, "rate": 1.0}).hex()
     select = {"do": "request", "link": "can", "row": ["", row.id, "telecommand"], "data": data}
     life = Life("cubestar", 1, ("can",), {}, ({"do": "wait", "s": 5.0}, select, {"do": "wait", "s": 5.0}))
-    assert run_once(life).violation.endswith("without a subscription")
+    assert run_once(life).violation.endswith("without a subscription or an event")
 
 
 def test_telemetry_that_is_streamed_to_a_former_address_is_found(monkeypatch):
