@@ -145,7 +145,7 @@ def test_without_a_thread_each_one_is_waited_for(factory):
         ("lsi", "overlap", float("nan"), "must be a finite number"),
         ("rsi", "gamma_min_deg", "x", "must be a number"),
         ("geometric", "fov_tolerance", 2.0, "must be 0…0.3, not 2.0"),
-        ("rsi", "limiting_magnitude", "x", r"must be a number \(given: 'x'\)"),
+        ("rsi", "magnitude_sigma", "x", r"must be a number \(given: 'x'\)"),
     ],
 )
 def test_an_option_that_the_algorithm_does_not_have_is_named(algorithm, option, value, said):
