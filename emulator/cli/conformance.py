@@ -164,12 +164,11 @@ def command(
     request, junit = cases.request(bench, tuple(patterns or ()), list_only=list_only), bench.junit
     console = Console(highlight=False, quiet=as_json)
     requested, left_out = requested_cases(request)
+    notice = left_out_text(left_out, [*requested, *left_out]) if left_out else ""
     if list_only:
         for item in requested:
             kind = "intrusive" if item.intrusive else "safe"
             print(f"{item.id}\t{kind}\t{item.title}\t{item.clause}")
-    notice = left_out_text(left_out, [*requested, *left_out]) if left_out else ""
-    if list_only:
         if notice:
             print(notice, file=sys.stderr)
         return

@@ -15,6 +15,8 @@ from starhil.hil_tests.judge.definition import Unit
 
 DELAYED_S: Final = 10.0
 """Steps in which output that faults have delayed is awaited once they have ended, seconds."""
+LONGEST_DELAY_S: Final = 86_400.0
+"""Time after which delayed output must have come: streams queue up behind slow messages during waits of half a day."""
 ORION: Final = {"kind": "fixed", "attitude": {"ra_deg": 83.8, "dec_deg": -1.2, "roll_deg": 0.0}}
 
 
@@ -117,8 +119,13 @@ class LifeRun:
         oracle = self._oracle
         oracle.faults_ended(self._unit.now_s)
         if oracle.disturbed:
+            end_s = self._unit.now_s + LONGEST_DELAY_S
             await self._unit.step(DELAYED_S)
             while any(self._unit.is_late(link) for link in oracle.disturbed):
+                if self._unit.now_s > end_s:
+                    raise Violation(
+                        f"output that faults delayed has not come {LONGEST_DELAY_S:.0f} s after their end"
+                    )
                 await self._unit.step(DELAYED_S)
             for link in oracle.disturbed:
                 self._unit.take(link)

@@ -40,8 +40,8 @@ static int64_t to_signed(uint64_t value, unsigned bits)
 {
     const unsigned shift = bits - 1u;
     const uint64_t sign = UINT64_C(1) << shift;
-    const uint64_t size = (value ^ (sign - 1u)) & (sign - 1u);
-    return (value & sign) != 0u ? (-(int64_t)size - 1) : (int64_t)value;
+    const uint64_t inverted = (value ^ (sign - 1u)) & (sign - 1u); /* of a negative number n: -n - 1 */
+    return (value & sign) != 0u ? (-(int64_t)inverted - 1) : (int64_t)value;
 }
 
 static float to_float(uint64_t raw)

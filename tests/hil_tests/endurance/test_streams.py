@@ -7,6 +7,7 @@ import pytest
 
 from starhil.emulator.cli.endurance import run_once
 from starhil.emulator.device.subscriptions import Subscriptions
+from starhil.emulator.launch.unit_in_memory import UnitUnderTest
 from starhil.hil_tests.endurance.life import Life, make_life
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.judge.definition import read_unit
@@ -81,6 +82,14 @@ def test_output_that_a_fault_has_delayed_is_awaited_until_it_has_come(units):
         start_mode="lost_in_space",
     )  # fmt: skip
     assert outcome.violation == ""
+
+
+def test_output_that_is_held_for_ever_is_a_violation(units, monkeypatch):
+    monkeypatch.setattr(UnitUnderTest, "is_late", lambda *_: True)
+    monkeypatch.setattr("starhil.hil_tests.endurance.run.LONGEST_DELAY_S", 60.0)
+    fault = {"do": "fault", "fault": {"serial": {"delay_s": 1.0}}}
+    outcome = outcome_of(units["as it is"], fault, {"do": "clear"})
+    assert outcome.violation == "output that faults delayed has not come 60 s after their end"
 
 
 def test_rows_that_look_like_answers_may_be_subscribed_to(tmp_path):
