@@ -15,10 +15,10 @@ from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, Val
 from starhil.hil_tests.client.raw_traffic import parse_frame, pattern
 from starhil.hil_tests.judge.links import BusName
 from starhil.protocol.can.frame import CanFrame
-from starhil.protocol.errors import OneLineError
+from starhil.protocol.errors import OneLineError, did_you_mean
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Row
-from starhil.protocol.icd.values import EnumDefinition, Parameter
+from starhil.protocol.icd.values import Parameter
 
 
 def _read_by(read: Callable[[str, InterfaceDefinition], Any]) -> PlainValidator:
@@ -54,8 +54,16 @@ def _telecommand(name: str, icd: InterfaceDefinition) -> Row:
     return icd.telecommands[name]
 
 
-def _member(name: str, enum: EnumDefinition) -> str:
-    enum.number(name)
+def _image_size(name: str, icd: InterfaceDefinition) -> str:
+    icd.enums["image_size"].number(name)
+    return name
+
+
+def _refusal(name: str, icd: InterfaceDefinition) -> str:
+    errors = icd.error_numbers
+    if name not in errors:
+        allowed = ", ".join(f"{known} ({number})" for known, number in errors.items())
+        raise ValueError(f"{name!r} is not one of {allowed}{did_you_mean(name, errors)}")
     return name
 
 
@@ -105,8 +113,8 @@ Telemetry = Annotated[Row, _read_by(_telemetry)]
 Readable = Annotated[Row, _read_by(_readable)]
 Telecommand = Annotated[Row, _read_by(_telecommand)]
 ParameterName = Annotated[Parameter, _read_by(lambda name, icd: icd.parameters[name])]
-Refusal = Annotated[str, _read_by(lambda name, icd: _member(name, icd.enums["error_code"]))]
-ImageSize = Annotated[str, _read_by(lambda name, icd: _member(name, icd.enums["image_size"]))]
+Refusal = Annotated[str, _read_by(_refusal)]
+ImageSize = Annotated[str, _read_by(_image_size)]
 HexBytes = Annotated[bytes, _read_by(_hex_bytes)]
 RawItem = Annotated[bytes | CanFrame, _read_by(_raw_item)]
 RawItems = Annotated[list[RawItem], BeforeValidator(_as_list), AfterValidator(_of_one_link)]

@@ -191,10 +191,16 @@ class InterfaceDefinition:
         """Whether CANopen is the only link of the unit."""
         return self.canopen is not None and self.link.serial is None and self.link.can is None
 
+    @property
+    def error_numbers(self) -> Mapping[str, int]:
+        """The unit's code of each error, by name."""
+        return self.errors or {code.name.lower(): int(code) for code in ErrorCode}
+
     def error_name(self, number: int) -> str:
         """Return the name of an error by the unit's code."""
-        numbers = self.errors or {code.name.lower(): int(code) for code in ErrorCode}
-        return next((name for name, known in numbers.items() if known == number), "unpublished code")
+        return next(
+            (name for name, known in self.error_numbers.items() if known == number), "unpublished code"
+        )
 
     def enum(self, name: str) -> EnumDefinition:
         """Return an enumeration of the unit or, if it has none of this name, of the device model."""

@@ -14,6 +14,7 @@ from starhil.hil_tests.session.session_run import find_script
 from starhil.hil_tests.session.steps import Command, Read, Sample, Send
 from starhil.protocol.files.bundled import bundled, bundled_units
 from starhil.protocol.unit import load_unit
+from tests.user_units import STREAM, written
 
 ICD = load_unit()
 
@@ -178,6 +179,18 @@ def test_a_flag_that_a_map_defines_is_true_or_false(wanted, tmp_path):
 def test_values_that_a_correct_obc_never_sends_are_allowed_where_a_refusal_is_expected(load):
     script = load("[[step]]\ncommand = 'set_mode'\nwith = { mode = 77 }\nrefused = 'invalid_parameter'")
     assert script.steps[0].refused == "invalid_parameter"
+
+
+def test_a_refusal_is_named_by_the_errors_of_the_unit(tmp_path):
+    path = tmp_path / "trial.toml"
+    errors = "\n[errors]\nok = 0\nother = 9\n"
+    for name, known, unknown in (("default", "invalid_id", "other"), ("its_own", "other", "invalid_id")):
+        unit = load_unit(written(tmp_path / name, STREAM + (errors if name == "its_own" else "")))
+        path.write_text(f"[[step]]\ncommand = 'ping'\nrefused = '{known}'")
+        assert load_script(path, unit).steps[0].refused == known
+        path.write_text(f"[[step]]\ncommand = 'ping'\nrefused = '{unknown}'")
+        with pytest.raises(ScriptError, match=rf"refused: '{unknown}' is not one of ok \(0\), {known} "):
+            load_script(path, unit)
 
 
 def test_a_missing_file_is_rejected_with_near_names(tmp_path):
