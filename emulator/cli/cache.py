@@ -6,11 +6,11 @@ import asyncio
 import json
 import logging
 import time
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from starhil.emulator.cli.options import OrbitChoice, ProfileArgument, names_of, with_orbit
+from starhil.emulator.cli.options import OrbitChoice, ProfileArgument, UnitChoice, absolute_unit, with_orbit
 from starid.cli.options import AsJson
 from starid.cli.output import compiling_reported
 
@@ -58,12 +58,7 @@ def info(as_json: AsJson = False) -> None:
 def warm(
     profile: ProfileArgument = None,
     orbit: OrbitChoice = None,
-    unit: Annotated[
-        str | None,
-        typer.Option(
-            help="Unit: a name or a folder; default: the profile's.", autocompletion=names_of("unit")
-        ),
-    ] = None,
+    unit: UnitChoice = None,
 ) -> None:
     """Compile the kernels and build the star index, as the first start of a profile does.
 
@@ -76,7 +71,7 @@ def warm(
     from starid.storage.cache import cache_dir, kernels_written_since
 
     begin_s = time.time()
-    targets = [(profile or DEFAULT_PROFILE, unit)]
+    targets = [(profile or DEFAULT_PROFILE, unit and absolute_unit(unit))]
     if profile is unit is None:
         targets += [(name, None) for name in bundled("profile") if name != DEFAULT_PROFILE]
         targets += [(DEFAULT_PROFILE, name) for name in bundled_units()]

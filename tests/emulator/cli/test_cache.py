@@ -135,6 +135,16 @@ def test_warming_the_cache_starts_a_pipeline_that_needs_every_kernel_and_the_ind
     assert index.read_text() == "4.2 1247.35 470.32"  # as in the profile
 
 
+def test_the_cache_is_warmed_for_a_unit_in_the_working_directory(
+    folder: Path, worker: Callable[..., object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ready = RECORDS_SETUP.format(path=folder.parent / "setup", outcome=f"PipelineReady({CAMERA}, 5, 0.0)")
+    worker(ready + RECORDS_INDEX.format(path=str(folder.parent / "index")))
+    monkeypatch.chdir(folder.parent)
+    assert run_command_line("unit", "new", "mine")[0] == 0
+    assert run_command_line("cache", "warm", "--unit", "mine")[::2] == (0, "")
+
+
 def test_a_failure_to_warm_the_cache_is_one_line(folder: Path, worker: Callable[..., object]) -> None:
     worker(RECORDS_SETUP.format(path=folder.parent / "setup", outcome="Failure('no catalogue')"))
     status, out, said = run_command_line("cache", "warm")
