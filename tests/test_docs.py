@@ -385,24 +385,6 @@ def test_walkthrough_by_steps(tmp_path):
         emulator.kill()
 
 
-@pytest.mark.process
-def test_walkthrough_pytest(unit, tmp_path):
-    (block,) = [
-        block
-        for block in blocks("walkthrough.md")
-        if block.language == "python" and block.heading == "4. Tests of an OBC team"
-    ]
-    file = tmp_path / "test_star_tracker.py"
-    file.write_text(block.text, encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", f"--rootdir={tmp_path}", str(file),
-         "--starhil-can", unit["can"]],
-        cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout
-    assert f"{block.text.count('def test_')} passed" in done.stdout
-
-
 @dataclass(frozen=True)
 class Exchange:
     """A frame that the walk-through sends with cansend, and the frames that it shows as the answer."""

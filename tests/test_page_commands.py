@@ -75,6 +75,22 @@ def shell_blocks(page: str) -> list[list[str]]:
     return [re.sub(r"\\\n *", "", block).splitlines() for block in [*fenced, *indented]]
 
 
+def files_of(page: str, *languages: str) -> dict[str, str]:
+    """Return the blocks of a page that begin with the name of a file, in a comment, by this name."""
+    text = PAGES[page].read_text(encoding="utf-8")
+    blocks = [block for language, block in _FENCED.findall(text) if language in languages]
+    return {
+        name[1]: block for block in blocks if (name := re.match(r"(?:#|/\*) (\S+\.\w+)(?: \*/)?\n", block))
+    }
+
+
+def write_all(files: dict[str, str], folder: Path) -> None:
+    """Write files into a folder, by their names."""
+    for name, text in files.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text, encoding="utf-8")
+
+
 def lines_of(page: str, first: str) -> list[str]:
     """Return the lines of the block of a page whose beginning matches a pattern."""
     (found,) = [lines for lines in shell_blocks(page) if lines and re.match(first, lines[0])]
@@ -160,11 +176,9 @@ def test_the_readme_types_no_file_that_its_reader_lacks():
 def folder(tmp_path, monkeypatch):
     """Work in a folder with the files that the pages name."""
     monkeypatch.chdir(tmp_path)
-    for path in PAGES.values():
-        for language, text in _FENCED.findall(path.read_text(encoding="utf-8")):
-            name = re.match(r"# (\S+\.toml)\n", text)
-            if language == "toml" and name is not None:
-                (tmp_path / name[1]).write_text(text, encoding="utf-8")
+    for page, path in PAGES.items():
+        write_all(files_of(page, "toml"), tmp_path)
+        for _language, text in _FENCED.findall(path.read_text(encoding="utf-8")):
             if text.startswith("CCSDS_AEM_VERS"):
                 (tmp_path / "slew.aem").write_text(text, encoding="utf-8")
             if text.startswith('title = "Quick check"'):
@@ -306,6 +320,33 @@ def test_a_unit_is_made_checked_and_run(shell):
         assert shell.type(line)
     shell.type(f"{run} --can off")
     assert shell.ready["unit"].endswith("my_unit")
+
+
+@pytest.mark.process
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_the_way_from_an_icd_to_a_ci_job(shell, folder):
+    """The files of the page, the commands that it types, and what its job runs, but for what installs packages."""
+    page = "docs/from-icd-to-ci.md"
+    new, *commands = (line for block in shell_blocks(page) for line in block)
+    files = files_of(page, "toml", "c", "python", "yaml")
+    job = re.findall(
+        r"^ +- run: ((?!pip|python).*)$", files[".github/workflows/star-tracker.yml"], re.MULTILINE
+    )
+    assert set(commands) - set(job) == {"starhil unit check heron"}
+    shutil.rmtree("heron")
+    shell.type(new)
+    write_all(files, folder)
+    shell.type("starhil unit check heron")
+    printed = [shell.type(line) for line in job]
+    assert [line.split()[0] for line in job] == ["starhil", "mkdir", "starhil", "starhil", "pytest"]
+    assert " 0 failed" in printed[2]
+    assert "3 passed, 0 failed" in printed[3]
+    assert "2 passed" in printed[4]
+    assert {path.name for path in Path("out").glob("*.xml")} == {
+        "conformance.xml",
+        "session.xml",
+        "pytest.xml",
+    }
 
 
 @pytest.mark.process
