@@ -42,6 +42,10 @@ def command(
             metavar="ADDRESS", help="Control channel of an emulator that runs already, from its ready line."
         ),
     ] = None,
+    assume_truth: Annotated[
+        bool,
+        typer.Option("--assume-truth", help="The unit looks where the script's table truth says."),
+    ] = False,
     baud: Annotated[int, typer.Option(help="Bit rate of a real serial line.")] = 115200,
     keep_going: Annotated[bool, typer.Option("--keep-going", help="Continue after a failed step.")] = False,
     as_json: AsJson = False,
@@ -78,6 +82,7 @@ def command(
         bench.junit,
         truth,
         control,
+        assume_truth,
         keep_going,
         quiet=as_json,
         view=bench.view,

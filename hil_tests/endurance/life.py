@@ -263,10 +263,16 @@ class LifeGenerator:
         return {**step, "data": data.hex()} if data else step
 
     def _read_any(self) -> Step:
+        if not self._telemetry:
+            return self._wait()
         return self._request(self._random.choice(self._telemetry))
 
     def _read_attitude(self) -> Step:
-        return self._request(self._random.choice(self._attitude_rows or self._telemetry))
+        return (
+            self._request(self._random.choice(self._attitude_rows))
+            if self._attitude_rows
+            else self._read_any()
+        )
 
     def _command(self) -> Step:
         if not self._telecommands:
@@ -287,7 +293,7 @@ class LifeGenerator:
         return self._request(row, row.encode(values))
 
     def _read_count(self) -> Step:
-        return self._request(self._random.choice(self._count_rows or self._telemetry))
+        return self._request(self._random.choice(self._count_rows)) if self._count_rows else self._read_any()
 
     def _clock(self) -> Step:
         if not self._clock_rows:
@@ -305,7 +311,8 @@ class LifeGenerator:
             if field.argument == "rate":
                 values[name] = self._random.choice([0.0, 10.0 ** self._random.uniform(-2.0, 0.7)])
             elif (field.argument or "").startswith("telemetry"):
-                number = self._random.choice(self._attitude_rows + self._telemetry).id
+                sent = self._attitude_rows + self._telemetry or list(self._definition.telemetry.values())
+                number = self._random.choice(sent).id
                 values[name] = number if self._random.random() < 0.5 or row.size < 8 else 0
         return self._request(row, row.encode(values))
 
@@ -314,6 +321,8 @@ class LifeGenerator:
         link = self._random.choice([link for link in self._links if link != "canopen"] or self._links[:1])
         harmless = [row for row in self._telecommands if row.action == "nothing"]
         rows = [min(kind, key=lambda row: row.size) for kind in (self._telemetry, harmless) if kind]
+        if not rows:
+            return self._wait()
         row = self._random.choice(rows)
         narrow = any(
             (field.value or "").startswith("counters.") and field.raw_limits[1] <= 0xFFFF
@@ -325,7 +334,9 @@ class LifeGenerator:
         return {**self._request(row, data), "do": "flood", "link": link, "count": count}
 
     def _cut(self) -> Step:
-        row = self._random.choice([*self._telecommands, *self._telemetry])
+        if not (rows := [*self._telecommands, *self._telemetry]):
+            return self._wait()
+        row = self._random.choice(rows)
         return {**self._request(row), "do": "cut", "share": round(self._random.uniform(0.1, 0.9), 2)}
 
     def _nmt(self) -> Step:
@@ -334,6 +345,8 @@ class LifeGenerator:
         return {"do": "nmt", "link": "canopen", "command": self._random.choice(NMT_COMMANDS)}
 
     def _burst(self) -> Step:
+        if not self._telemetry:
+            return self._wait()
         rows = [self._random.choice(self._telemetry) for _ in range(self._random.randint(2, 6))]
         link = self._random.choice([link for link in self._links if link != "canopen"] or self._links[:1])
         return {"do": "burst", "link": link, "rows": [[row.message_class, row.id, row.kind] for row in rows]}
@@ -389,7 +402,8 @@ class LifeGenerator:
     # --- invalid input ---
 
     def _invalid(self) -> Step:
-        rows = [*self._telecommands, *self._telemetry]
+        if not (rows := [*self._telecommands, *self._telemetry]):
+            return self._wait()
         row = self._random.choice(rows)
         match self._random.randrange(3):
             case 0:
@@ -465,7 +479,7 @@ class LifeGenerator:
             {"clock": {"drift_ppm": round(chance.uniform(-200.0, 200.0), 3)}},
             {"clock": {"jump_s": chance.choice([-0.25, 0.5, 30.0])}},
         ]
-        if "canopen" not in self._links:
+        if "canopen" not in self._links and self._telemetry:
             row = chance.choice(self._telemetry)
             kinds.append({"telemetry": [{"row": row.name, "freeze": "all"}]})
             numbers = [

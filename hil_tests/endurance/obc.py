@@ -265,8 +265,10 @@ class Obc:
             # in dialects a and b, data and the code of a refusal may both be one byte
             if line is None or line.dialect not in ("a", "b") or row is None or row.size != 1:
                 yield "accepted, must be refused"
-        elif expected != ("echo",) and sum(reply.final for reply in replies) != 1:
-            yield f"{sum(reply.final for reply in replies)} answers"
+        elif expected != ("echo",):
+            ends, wanted = sum(reply.final for reply in replies), _final_answers(port, expected)
+            if ends != wanted:
+                yield f"{ends} answers, not {wanted}"
 
     def _expected_answers(self, link: str, row: Row | None) -> Sequence[str]:
         if row is None:
@@ -383,6 +385,13 @@ class Obc:
         self._oracle.read(row, replies[-1].data)
         if not self._definition.telemetry[row.name].decode(replies[-1].data)[field]:
             raise Violation(f"{row.name}: no valid attitude {recovery_s:g} s after the last fault has ended")
+
+
+def _final_answers(port: Port, expected: Sequence[str]) -> int:
+    """Return how many answers to an accepted request are final: each, or the last where an answer says whether it is."""
+    if isinstance(port, CanopenPort) or (isinstance(port, SerialPort) and port.line.envelope.has_final):
+        return 1
+    return sum(answer != "echo" for answer in expected)
 
 
 _SETTERS: Final = frozenset({"set_parameter", "restore_parameters", "default_parameters"})

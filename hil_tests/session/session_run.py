@@ -53,6 +53,8 @@ class SessionRequest:
     truth: Path | None = None
     control: str | None = None
     """Address of the control channel of an emulator that runs already."""
+    assume_truth: bool = False
+    """Whether the unit is known to look where the script has the truth."""
     keep_going: bool = False
     quiet: bool = False
     view: str | None = None
@@ -94,7 +96,7 @@ def run_session(request: SessionRequest) -> SessionResult:
     console = Console(highlight=False, quiet=request.quiet)
     console.print(Text(escape_controls(script.title), style="bold"))
     if not request.start and request.control is None and _asks_for_an_emulator(script):
-        hint = "This session expects the emulator that --start makes (--control ADDRESS checks it). To make it by hand: "
+        hint = "This session expects the emulator that --start starts (--control ADDRESS checks it). To start it by hand: "
         hint += start_command(script, folder)
         console.print(Text(escape_controls(hint), style="yellow"), soft_wrap=True)
     show: Callable[[StepResult], None] = partial(_print_result, console)
@@ -129,9 +131,14 @@ def run_session(request: SessionRequest) -> SessionResult:
 
 
 def _asks_for_an_emulator(script: Script) -> bool:
-    """Return whether a script names a profile or settings of the emulator, or where the sensor looks."""
-    wanted = script.emulator
-    return bool(wanted.profile or wanted.settings or script.truth.attitude)
+    """Return whether a script names a profile or settings of the emulator."""
+    return bool(script.emulator.profile or script.emulator.settings)
+
+
+def _compares_with_its_attitude(script: Script) -> bool:
+    """Return whether a step compares with the attitude that a script has as the truth."""
+    checks = [step.attitude for step in script.steps if step.attitude is not None]
+    return script.truth.attitude is not None and any(check.attitude is None for check in checks)
 
 
 def start_command(script: Script, folder: Path) -> str:
@@ -176,13 +183,21 @@ def _check_steps(
 ) -> None:
     """Raise ScriptError if a step can never pass on these links, needs an emulator that the bench starts, or a truth that is missing."""
     controlled = request.start or request.control is not None
-    if script.truth.file is not None and request.truth is None and not controlled:
+    if request.truth is None and not controlled:
         folder = request.folder or DEFAULT_FOLDER / path.stem
-        log = shlex.quote(str(folder / script.truth.file))
-        raise ScriptError(
-            f"{path.name}: compares attitudes with a truth that the emulator writes: use --start; or start it by: "
-            f"{start_command(script, folder)} and give --truth {log}, or its control channel with --control"
-        )
+        start = start_command(script, folder)
+        if script.truth.file is not None:
+            log = shlex.quote(str(folder / script.truth.file))
+            raise ScriptError(
+                f"{path.name}: compares attitudes with a truth that the emulator writes: use --start; or give --truth {log}, or "
+                f"--control with the address on the ready line, for an emulator that runs by: {start}"
+            )
+        if _compares_with_its_attitude(script) and not request.assume_truth:
+            raise ScriptError(
+                f"{path.name}: compares attitudes with its [truth], and nothing shows that the unit looks there: use --start; or give "
+                "--assume-truth if it does; or --control with the address on the ready line, for an emulator that runs by: "
+                f"{start}"
+            )
     for number, step, link in script.planned(links):
         why = ""
         if step.needs_emulator and not request.start:

@@ -124,15 +124,32 @@ def test_a_session_injects_faults_into_the_emulator_that_it_started(tmp_path):
     assert "blocked_shar: unknown key; did you mean blocked_share?" in result["results"][5]["detail"]
 
 
-def test_a_script_whose_truth_nobody_writes_is_rejected_with_the_command_that_does(tmp_path):
-    done = starhil("session", "slew_tracking", "--can", "socketcand:127.0.0.1:1/vcan0", "--log", tmp_path)
-    assert done.returncode == 2
+def test_a_script_whose_truth_nothing_confirms_is_rejected_with_the_command_that_does(tmp_path):
+    def rejection(script, *words):
+        done = starhil("session", script, *words, "--log", tmp_path / "log")
+        assert done.returncode == 2
+        assert not (tmp_path / "log").exists()
+        return done.stderr
+
+    written = rejection("slew_tracking", "--can", "socketcand:127.0.0.1:1/vcan0")
     assert (
-        "slew_tracking.toml: compares attitudes with a truth that the emulator writes: use --start"
-        in done.stderr
+        "slew_tracking.toml: compares attitudes with a truth that the emulator writes: use --start" in written
     )
-    assert "starhil run ideal --set truth.kind=rate" in done.stderr
-    assert f"--truth-log {tmp_path / 'truth.csv'}" in done.stderr
+    assert "starhil run ideal --set truth.kind=rate" in written
+    assert f"--truth-log {tmp_path / 'log' / 'truth.csv'}" in written
+    stated = rejection("first_light", "--serial", "/dev/no-such-port")
+    assert "first_light.toml: compares attitudes with its [truth], and nothing shows that the unit" in stated
+    assert "for an emulator that runs by: starhil run cubestar --set" in stated
+    opened = starhil(
+        "session",
+        "first_light",
+        "--serial",
+        "/dev/no-such-port",
+        "--assume-truth",
+        "--log",
+        tmp_path / "log",
+    )
+    assert "serial /dev/no-such-port: no such port" in opened.stderr
 
 
 def test_the_commands_for_an_emulator_that_runs_work_as_the_page_has_them(tmp_path, monkeypatch):

@@ -13,7 +13,7 @@ from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.judge.definition import read_unit
 from tests.test_docs import blocks
 from tests.test_your_unit import PAGE, STREAMING, written
-from tests.user_units import ATTITUDE, HEAD, STREAM
+from tests.user_units import ATTITUDE, HEAD, PACKETS, STREAM
 from tests.user_units import written as user_unit
 
 pytestmark = pytest.mark.long
@@ -99,6 +99,39 @@ def test_rows_that_look_like_answers_may_be_subscribed_to(tmp_path):
     outcome = outcome_of(folder, *steps, start_mode="lost_in_space")
     assert outcome.violation == ""
     assert outcome.readings > 5
+
+
+def test_lives_of_a_unit_whose_telemetry_cannot_be_requested_end_without_a_violation(tmp_path):
+    folder = user_unit(tmp_path / "unit", PACKETS.replace("LENGTH", "u16"))
+    unit = read_unit(folder)
+    assert not unit.readable
+    lives = [make_life(unit, "packets", ("serial",), seed, 40) for seed in range(4)]
+    outcomes = [run_once(replace(life, unit=str(folder))) for life in lives]
+    assert [outcome.violation for outcome in outcomes] == [""] * len(lives)
+    assert sum(outcome.readings for outcome in outcomes) > 1000
+
+
+TWO_ANSWERS = """
+[[telecommand]]
+id = 10
+name = "measure"
+doc = "d"
+action = "set_mode"
+answer = ["reply", "row:mode"]
+fields = [{ name = "mode", type = "u8", argument = "mode", map = { 1 = "standby", 2 = "lost_in_space" } }]
+"""
+
+
+def test_a_telecommand_is_answered_as_often_as_the_definition_says(tmp_path):
+    folder = user_unit(
+        tmp_path / "unit", HEAD + TWO_ANSWERS + MODES_ON_TWO_LINKS.replace('unsolicited = ["mode"]\n', "")
+    )
+    unit = read_unit(folder)
+    steps = [request(unit, "measure", link, mode="standby") for link in ("serial", "can")]
+    life = Life(str(folder), 1, ("serial", "can"), {"parameters": {"start_mode": "standby"}}, (WAIT, *steps))
+    outcome = run_once(life)
+    assert outcome.violation == ""
+    assert outcome.readings == len(steps)
 
 
 MODES_ON_TWO_LINKS = """
