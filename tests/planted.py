@@ -174,12 +174,12 @@ def _constants(module: types.ModuleType, source: str, old_source: str) -> dict[s
     They are computed with the module's own classes: a table whose keys were members of a second enumeration of the same name
     would find nothing.
     """
-    old = {ast.dump(statement) for statement in ast.parse(old_source).body}
+    old = {text for text, _ in _statements(old_source)}
     values = dict(vars(module))
     changed: set[str] = set()
     constants: dict[str, object] = {}
-    for statement in ast.parse(source).body:
-        if ast.dump(statement) in old and not changed & _names(statement, ast.Load):
+    for text, statement in _statements(source):
+        if text in old and not changed & _names(statement, ast.Load):
             continue
         if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
             changed.add(statement.name)
@@ -190,6 +190,20 @@ def _constants(module: types.ModuleType, source: str, old_source: str) -> dict[s
             changed |= names
             constants |= {name: values[name] for name in names}
     return constants
+
+
+@functools.lru_cache(maxsize=64)
+def _statements(source: str) -> list[tuple[str, ast.stmt]]:
+    """Return the statements of a module, each with its lines, from its decorators on."""
+    lines = source.splitlines(keepends=True)
+    statements = ast.parse(source).body
+    begins = [
+        min([each.lineno, *(of.lineno for of in getattr(each, "decorator_list", ()))]) for each in statements
+    ]
+    return [
+        ("".join(lines[begin - 1 : each.end_lineno]), each)
+        for begin, each in zip(begins, statements, strict=True)
+    ]
 
 
 def _names(statement: ast.stmt, use: type[ast.expr_context]) -> set[str]:

@@ -129,11 +129,10 @@ class TransmitPdo(Pdo):
     @property
     def next_deadline(self) -> float | None:
         """When the event timer expires or the inhibit time ends for a waiting event."""
-        if not self.active or self._synchronous:
+        due = self._free_at if self._event else self._event_at
+        if due is None or not self.active or self._synchronous:
             return None
-        if self._event:
-            return self._free_at
-        return None if self._event_at is None else max(self._event_at, self._free_at)
+        return max(due, self._free_at)
 
     def start(self) -> None:
         """Enter OPERATIONAL: an event-driven PDO is sent once, acyclic ones wait for an event."""

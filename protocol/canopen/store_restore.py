@@ -90,10 +90,10 @@ class StoreRestore:
         """Set the entries to their defaults, then to their stored values."""
         dictionary = self._context.dictionary
         dictionary.load_defaults(self._context.node_id)
-        entries = {_name(entry): entry for entry in dictionary.entries.values()}
-        for name, value in self._stored(COMMUNICATION).items():
-            entry = entries.get(name)
-            if entry is not None and _is_stored(entry) and entry.size in {None, len(value)}:
+        stored = self._stored(COMMUNICATION)
+        for entry in dictionary if stored else ():
+            value = stored.get(_name(entry))
+            if value is not None and _is_stored(entry) and entry.size in {None, len(value)}:
                 entry.value = value
 
     def load_lss(self) -> tuple[int, int] | None:

@@ -57,7 +57,9 @@ def one_line(text: str) -> str:
 
     The other characters could end a line, reorder the text or are not allowed in XML.
     """
-    return " ".join("".join(letter if letter.isprintable() else " " for letter in text).split())
+    if not text.isprintable():
+        text = "".join(letter if letter.isprintable() else " " for letter in text)
+    return " ".join(text.split())
 
 
 def ascii_line(text: str) -> str:
