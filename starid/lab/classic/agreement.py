@@ -37,7 +37,7 @@ def group_around(
 
     Those that agree with the most others come first; their rows are written to `members` (m,).
     """
-    n = pairs.shape[0]
+    n, most = pairs.shape[0], 0
     support = np.zeros(n, dtype=np.int64)
     with_seed = np.zeros(n, dtype=np.bool_)
     for i in range(n):
@@ -47,19 +47,21 @@ def group_around(
             for j in range(n):
                 if with_seed[j] and compatible(directions, vectors, pairs, i, j, tolerance):
                     support[i] += 1
+        most = max(most, support[i])
     members[0] = seed
     count = 1
-    for i in np.argsort(-support, kind="mergesort"):
-        if not with_seed[i]:
-            continue
-        good = True
-        for k in range(1, count):
-            if not compatible(directions, vectors, pairs, i, members[k], tolerance):
-                good = False
-                break
-        if good:
-            members[count] = i
-            count += 1
+    for number in range(most, -1, -1):
+        for i in range(n):
+            if not with_seed[i] or support[i] != number:
+                continue
+            good = True
+            for k in range(1, count):
+                if not compatible(directions, vectors, pairs, i, members[k], tolerance):
+                    good = False
+                    break
+            if good:
+                members[count] = i
+                count += 1
     return count
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from starid.arithmetic.arrays import Array, Array32, Indices, Indices32
 from starid.kernels.jit import compiled_ieee, inner
+from starid.kernels.small_arrays import copy_values, median
 
 MAX_TIED: Final = 4
 """Most guide stars with equal votes that a pivot may pass to the last step; more are not significant."""
@@ -113,9 +114,9 @@ def bright_neighbour(
     values = np.empty(count)
     for i in range(count):
         values[i] = magnitude[rows[i]]
-    middle = np.median(values) if count > 0 else 0.0
+    middle = median(values, count) if count > 0 else 0.0
     for i in range(count):
-        if polar[i, 0] > buffer and values[i] <= middle:
+        if polar[i, 0] > buffer and magnitude[rows[i]] <= middle:
             if rank == 0:
                 return i
             rank -= 1
@@ -160,7 +161,7 @@ def neighbour_table(vectors: Array, radius: float) -> tuple[Indices32, Array32, 
     for star in range(n):
         neighbours_of(vectors, star, radius, polar, rows)
         for i in range(start[star + 1] - start[star]):
-            every[start[star] + i] = polar[i]
+            copy_values(polar[i], every[start[star] + i])
             whose[start[star] + i] = rows[i]
     return start, every, whose
 
@@ -188,7 +189,9 @@ def add_winners(votes: Indices32, least: int, pivot: int, matches: Indices, fill
     They need at least `least` votes, and no more than `MAX_TIED` may be tied. `matches` (n·`MAX_TIED`, 2)
     receives the pivot and the guide star.
     """
-    most = votes.max()
+    most = votes[0]
+    for number in votes:
+        most = max(most, number)
     if most < least:
         return filled
     count = 0

@@ -286,9 +286,11 @@ class ClassicIdentifier(VerifiedIdentifier):
         if sigmas is not None and rows.size:
             deviation = math.sqrt(2.0 * float(np.mean(sigmas[rows] ** 2)))
             tolerance_px = max(self.sigmas * deviation, _MIN_TOLERANCE_PX)
-        return Observed(
-            np.ascontiguousarray(directions[rows]), magnitude[:count], rows, tolerance_px / self._px_per_rad
-        )
+        directions = np.ascontiguousarray(directions[rows])
+        directions.setflags(
+            write=False
+        )  # as those of the guide stars, so that kernels are compiled for both at once
+        return Observed(directions, magnitude[:count], rows, tolerance_px / self._px_per_rad)
 
     def _raw(self, xy: Array, observed: Observed, pairs: Indices) -> Solution:
         """Fit the attitude to the matched stars by least squares, without verification."""
