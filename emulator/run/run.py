@@ -20,7 +20,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 
 from starhil.emulator.device.surroundings import orbit_of
 from starhil.emulator.errors import EmulatorError
@@ -153,8 +153,13 @@ class Run:
 def _unit_of(profile: Profile) -> InterfaceDefinition:
     """Return the unit of a profile, which must have the requested links."""
     icd = load_unit(profile.unit_source)
-    errors, _ = served(icd)
-    if errors:
+    if errors := _unserved(icd):
         raise EmulatorError(*errors)
     check_links(profile, icd)
     return icd
+
+
+@lru_cache(maxsize=8)
+def _unserved(icd: InterfaceDefinition) -> list[str]:
+    """Return what keeps a device from serving a definition; the heads of a run, and runs of a campaign, share bundled units."""
+    return served(icd)[0]

@@ -50,7 +50,7 @@ SELECTION: Final = "unsolicited_selection"
 """Parameter that selects a row to be sent unsolicited."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class InterfaceDefinition:
     """The interface between a device and an OBC: rows, enumerations and parameters."""
 
