@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.icd.codec import Field, Row
-from starhil.protocol.icd.conventions import Conventions
-from starhil.protocol.icd.units_of_measure import factor
-from starhil.protocol.icd.values import Value
+
+if TYPE_CHECKING:
+    from starhil.protocol.icd.codec import Field, Row
+    from starhil.protocol.icd.conventions import Conventions
+    from starhil.protocol.icd.values import Value
 
 ARCSEC_PER_RAD: Final = math.degrees(1.0) * 3600.0
 _NORM_TOLERANCE: Final = 0.02
@@ -148,6 +149,8 @@ def attitude_in(row: Row, values: Mapping[str, Value]) -> Quaternion:
         if field.value == "attitude.valid"
     ):
         raise BenchError(f"the attitude is not valid (reason {values.get('reason', '?')!s})")
+    from starhil.protocol.icd.units_of_measure import factor  # with all of the definition, which a truth does not need
+
     fields, rotation = named_fields
     return rotation([float(values[field.name]) * (factor(field.unit, "rad") or 1.0) for field in fields])
 

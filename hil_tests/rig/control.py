@@ -7,7 +7,7 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 from urllib.parse import urlsplit
 
 from starhil.hil_tests.attitude import (
@@ -19,7 +19,9 @@ from starhil.hil_tests.attitude import (
 )
 from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE, BenchError
 from starhil.protocol.errors import reason
-from starhil.protocol.icd.conventions import Conventions
+
+if TYPE_CHECKING:
+    from starhil.protocol.icd.conventions import Conventions
 
 __tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 

@@ -50,3 +50,9 @@ def test_the_pipeline_starts_without_the_libraries_of_the_links() -> None:
     assert not {"asyncio", "ssl", "pydantic", "typer", "can", "canopen", "construct"} & set(
         done.stdout.split()
     )
+
+
+def test_the_process_of_an_fmu_starts_without_the_definition() -> None:
+    text = "import sys, starhil.emulator.cli.fmu.process; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
+    assert not {"numpy", "pydantic", "asyncio", "starhil.protocol.icd"} & set(done.stdout.split())

@@ -57,7 +57,7 @@ def fmu2(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def export(fmi: str, folder: Path) -> Path:
     profile, quick = folder / "acquiring.toml", folder / QUICK
     profile.write_text('extends = "ideal"\n[parameters]\nstart_mode = "lost_in_space"\n')
-    quick.write_text(profile.read_text() + '[run]\nworker = "error_model"\n')
+    quick.write_text(profile.read_text() + '[run]\nworker = "error_model"\n[camera]\ndistortion = []\n')
     target = folder / f"fmi{fmi}.fmu"
     done = run_command_line("fmu", "export", str(profile), "--fmi", fmi, "-o", str(target))
     assert done == (0, "", "")
@@ -80,10 +80,10 @@ def refused(function: str) -> Iterator[None]:
 def tumble(seconds: float) -> np.ndarray:
     """A torque-free asymmetric body: time, quaternion ICRS→body that rotates vectors, rate in degrees per second."""
     inertia, rate = np.array([0.05, 0.14, 0.10]), np.radians([0.2, -0.1, 0.2])
-    to_icrs, fine, rows = Rotation.identity(), STEP_S / 20, []
+    to_icrs, fine, rows = Rotation.identity(), STEP_S / 4, []
     for t in np.arange(0.0, seconds + STEP_S / 2, STEP_S):
         rows.append((t, *to_icrs.inv().as_quat(), *np.degrees(rate)))
-        for _ in range(20):
+        for _ in range(4):
             middle = rate - 0.5 * fine * np.cross(rate, inertia * rate) / inertia
             to_icrs *= Rotation.from_rotvec(middle * fine)
             rate = rate - fine * np.cross(middle, inertia * middle) / inertia

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import tty
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
 from tests.emulator.workers import NEVER_READY
+from tests.process.conftest import NO_IMAGES_OPTIONS
 from tests.protocol.serial.composed_links import CUBESTAR
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -229,8 +231,9 @@ def test_another_algorithm_runs_in_the_device():
 def test_the_real_clock_runs_by_itself_and_ends_on_sigint(tmp_path):
     log = tmp_path / "truth.csv"
     emulator = Emulator(
-        "--truth-log", str(log), "--set", "parameters.update_rate=10", "--set", "links.serial.dialect=a"
-    )
+        "--truth-log", str(log), "--set", "parameters.update_rate=10", "--set", "links.serial.dialect=a",
+        *NO_IMAGES_OPTIONS,
+    )  # fmt: skip
     assert emulator.read("device_status")["mode"] == "standby"
     assert emulator.command("set_mode", mode="lost_in_space") == 0
     while emulator.read("device_status")["frames_captured"] < 5:
@@ -247,19 +250,19 @@ def test_the_real_clock_runs_by_itself_and_ends_on_sigint(tmp_path):
 def test_a_hangup_ends_the_run_in_good_order(tmp_path):
     """SIGTERM ends that of `stepped`, SIGINT that of the real clock."""
     link = tmp_path / "tty"
-    emulator = Emulator("--symlink", str(link), "--set", "run.worker=error_model")
+    emulator = Emulator("--symlink", str(link), *NO_IMAGES_OPTIONS)
     assert emulator.end(signal.SIGHUP) == (0, [])
     assert not link.is_symlink()
 
 
-def test_a_signal_to_the_worker_too_ends_the_run_quietly():
-    emulator = Emulator("--clock", "stepped", "--set", "parameters.start_mode=lost_in_space")
-    children = Path(f"/proc/{emulator.process.pid}/task/{emulator.process.pid}/children").read_text().split()
+def test_a_signal_to_the_worker_too_disturbs_no_image(stepped):
+    """Nor is it reported: what `stepped` has said is seen at its end."""
+    children = Path(f"/proc/{stepped.process.pid}/task/{stepped.process.pid}/children").read_text().split()
     assert children
     for child in children:
         os.kill(int(child), signal.SIGTERM)
-    emulator.do("step", seconds=3.0)  # waits for frames, which a worker that has ended no longer makes
-    assert emulator.end() == (0, [])
+    assert stepped.command("set_mode", mode="lost_in_space") == 0
+    stepped.do("step", seconds=3.0)  # waits for frames, which a worker that has ended no longer makes
 
 
 def is_running(pid: str) -> bool:
@@ -279,7 +282,7 @@ def test_the_worker_ends_with_a_killed_emulator_and_the_next_one_takes_its_place
     assert code == -signal.SIGKILL
     wait_until(lambda: not is_running(worker))
     assert link.is_symlink()
-    emulator = Emulator(*arguments)
+    emulator = Emulator(*arguments, *NO_IMAGES_OPTIONS)
     assert emulator.read("boot_status")["boot_count"] == 2
     assert emulator.end() == (0, [])
 
@@ -312,15 +315,15 @@ def check_rejected(arguments, message):
     assert message in line
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_signals_to_an_emulator_that_ends_do_not_change_its_status(number):
+def test_signals_to_an_emulator_that_ends_do_not_change_its_status():
     """Sent until the process is gone: one in its last tenth of a second ended it by the signal."""
     emulator = Emulator("--clock", "stepped")
     emulator.do("quit")
     os.close(emulator.fd)
     emulator.control.close()
     deadline = time.monotonic() + PATIENCE_S
+    numbers = cycle((signal.SIGTERM, signal.SIGINT, signal.SIGHUP))
     while emulator.process.poll() is None and time.monotonic() < deadline:
-        emulator.process.send_signal(number)
+        emulator.process.send_signal(next(numbers))
         time.sleep(0.001)
     assert (emulator.process.wait(timeout=1.0), log_lines(emulator.process.stderr.read())) == (0, [])
