@@ -149,7 +149,7 @@ def attitude_in(row: Row, values: Mapping[str, Value]) -> Quaternion:
         if field.value == "attitude.valid"
     ):
         raise BenchError(f"the attitude is not valid (reason {values.get('reason', '?')!s})")
-    from starhil.protocol.icd.units_of_measure import factor  # with all of the definition, which a truth does not need
+    from starhil.protocol.icd.units_of_measure import factor  # loads the definition, which no truth needs
 
     fields, rotation = named_fields
     return rotation([float(values[field.name]) * (factor(field.unit, "rad") or 1.0) for field in fields])

@@ -19,10 +19,18 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from tests.candump import parse_candump, read_candump
 from tests.process.conftest import NO_IMAGES, needs_vcan0
+from tests.process.test_conformance import conform
 from tests.process.test_sessions import starhil
 from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
+
+CAN = ("frames", "segments", "bursts", "errors", "recovery", "unsolicited")
+CANOPEN = ("nmt", "error-control", "sdo", "sdo-block", "sync", "tpdo", "rpdo")
+"""Areas of conformance about IDs, kinds, order and loss of frames; what rows and objects hold is the same on every bus."""
+
+SPEED = 0.25
+"""Simulation time per second: the guest has one slow processor, and time-outs are rules that stay."""
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +44,7 @@ def unit(tmp_path_factory):
         seed=1,
         settings=["truth.attitude.roll_deg=30", *NO_IMAGES],
         state_dir=state,
-        extra=["--canopen", "44"],
+        extra=["--canopen", "44", "--clock", f"scaled:{SPEED}"],
     )
     with EmulatorProcess(command, ready_within_s=PATIENCE_S) as process:
         yield process
@@ -156,6 +164,13 @@ def test_the_kernel_sends_periodic_requests_and_each_is_answered(obc):
     assert type(task).__name__ == "CyclicSendTask"
     assert replies == 25
     assert obc.telemetry("communication_status")["telemetry_count"] >= 26
+
+
+def test_conformance_cases_about_frames_pass_on_the_kernel_bus(unit):
+    areas = [*(f"can.{area}" for area in CAN), *(f"canopen.{area}" for area in CANOPEN)]
+    outcomes = conform(*areas, "--intrusive", "--can", "vcan0", "--canopen", "44", "--speed", str(SPEED))
+    assert {item["status"] for item in outcomes} == {"passed"}
+    assert {item["id"].rpartition(".")[0] for item in outcomes} == set(areas)
 
 
 @contextlib.contextmanager
