@@ -43,6 +43,8 @@ _ODDS: Final = log(FOUND_SHARE / (1.0 - FOUND_SHARE))
 _STEEPEST: Final = 100.0
 """Standard deviation of the prior of the slope, 1/mag."""
 _STEPS: Final = 30
+_CONVERGED: Final = 1e-10
+"""Change of the logit and of the slope in a step, after which the next one, squared, is below the arithmetic."""
 _LEAST_WEIGHT: Final = 1e-9
 _MAD_TO_SIGMA: Final = 1.4826
 
@@ -122,6 +124,9 @@ def _fitted_curve(magnitude: Array, detected: Mask) -> tuple[float, float]:
         share = 1.0 / (1.0 + elementwise(exp, -product(design, curve)))
         weight = np.maximum(share * (1.0 - share), _LEAST_WEIGHT)
         slopes = np.sum(design * (detected - share)[:, None], axis=0) - product(prior, curve)
-        curve += product(inverse(sum_of_products(design, design * weight[:, None]) + prior), slopes)
+        change = product(inverse(sum_of_products(design, design * weight[:, None]) + prior), slopes)
+        curve += change
+        if np.abs(change).max() < _CONVERGED:
+            break
     slope = -float(curve[1])
     return middle + (float(curve[0]) / slope if slope else math.inf), slope

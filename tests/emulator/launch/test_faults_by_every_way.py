@@ -320,7 +320,7 @@ SETTINGS: Final = {
     "cubestar": [
         "orbit=leo",
         "links.serial.dialect=c",
-        "parameters.unsolicited_rate=20",
+        "parameters.unsolicited_rate=10",
         "parameters.unsolicited_selection=160",
     ],
     "sagitta": ["orbit=leo"],
