@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -23,9 +23,8 @@ from starhil.protocol.icd.values import Value
 from starhil.protocol.serial.stack import SerialStack
 from tests.waiting import PATIENCE_S
 
-FLAGS = [
-    "-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-fsanitize=address,undefined", "-fno-sanitize-recover=all",
-]  # fmt: skip
+WARNINGS = ["-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic"]
+FLAGS = [*WARNINGS, "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
 _MAIN = r"""
@@ -325,7 +324,13 @@ def driver_source(icd: InterfaceDefinition, *, composed: bool) -> str:
 class CDriver:
     """The compiled program of a definition, as a process; a context manager."""
 
-    def __init__(self, icd: InterfaceDefinition, folder: Path, stack: SerialStack | None = None) -> None:
+    def __init__(
+        self,
+        icd: InterfaceDefinition,
+        folder: Path,
+        stack: SerialStack | None = None,
+        flags: Sequence[str] = FLAGS,
+    ) -> None:
         if COMPILER is None:
             pytest.skip("no C compiler (cc, gcc or clang) here: the exported C is not compiled")
         stack = stack or SerialStack(icd)
@@ -335,7 +340,7 @@ class CDriver:
         self._program = folder / "driver"
         sources = [folder / "driver.c", folder / f"{prefix_of(icd)}.c"]
         done = subprocess.run(
-            [COMPILER, *FLAGS, "-o", self._program, *sources], capture_output=True, text=True, check=False
+            [COMPILER, *flags, "-o", self._program, *sources], capture_output=True, text=True, check=False
         )
         assert (done.returncode, done.stderr) == (0, "")
 

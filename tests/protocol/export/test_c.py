@@ -19,14 +19,15 @@ from starhil.protocol.can.cubespace import CanHostReceiver, encode_reply_frames,
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export.c import prefix_of, render_folder
-from starhil.protocol.icd import FieldError, UnknownNameError
+from starhil.protocol.export.c.rows import is_single
+from starhil.protocol.icd import FieldError, InterfaceDefinition, UnknownNameError
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.quoting import c_member
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
 from tests.emulator.units.clients import Emulated, with_unit
-from tests.protocol.export.c_driver import CDriver, c_words, hex_or_none
+from tests.protocol.export.c_driver import FLAGS, WARNINGS, CDriver, c_words, hex_or_none
 from tests.protocol.export.test_export import by_name, packets
 from tests.protocol.serial.composed_links import CUBESPACE, CUBESTAR
 from tests.test_your_unit import written
@@ -311,11 +312,34 @@ def test_every_row_is_answered_by_the_emulated_unit_on_can(c: CDriver) -> None:
 # -- other units -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["sagitta", "nos3", "st16", "cubestar-gen2", "tutorial"])
+def one_of_each_kind(icd: InterfaceDefinition) -> InterfaceDefinition:
+    """The definition with those rows only that have a field of a kind which no row before has."""
+    seen, names = set(), []
+    for row in icd.rows:
+        kinds = {(row.kind, each.kind, each.type, each.scaled, is_single(each)) for each in row.fields}
+        if not kinds <= seen:
+            names.append(row.name)
+        seen |= kinds
+    return icd.with_rows(names)
+
+
+@pytest.mark.parametrize("name", ["sagitta", "nos3", "st16", "tutorial"])
 def test_the_rows_of_a_unit_have_the_same_bytes_and_values_both_ways(name: str, tmp_path: Path) -> None:
-    icd = load_unit(written(tmp_path / "lynx") if name == "tutorial" else name)
-    rng = random.Random(name)
-    with CDriver(icd, tmp_path) as driver:
+    both_ways(load_unit(written(tmp_path / "lynx") if name == "tutorial" else name), tmp_path, FLAGS)
+
+
+@pytest.mark.parametrize("flags", [WARNINGS, FLAGS], ids=["all rows", "sanitizers"])
+def test_the_rows_of_a_large_unit_have_the_same_bytes_and_values_both_ways(
+    flags: list[str], tmp_path: Path
+) -> None:
+    """With sanitizers the code of all rows would be compiled for a quarter of a minute."""
+    icd = load_unit("cubestar-gen2")
+    both_ways(one_of_each_kind(icd) if flags == FLAGS else icd, tmp_path, flags)
+
+
+def both_ways(icd: InterfaceDefinition, folder: Path, flags: list[str]) -> None:
+    rng = random.Random(icd.name)
+    with CDriver(icd, folder, flags=flags) as driver:
         for row in (row for row in icd.rows if row.named_fields):
             for values, data in packets(row):
                 assert driver("decode", row.name, data.hex()) == ["0", *c_words(row, row.decode(data))]

@@ -180,7 +180,9 @@ def test_errors_of_magnitudes_leave_the_region_useless():
 
 def test_while_the_features_disagree_the_whole_database_is_searched():
     rng = np.random.default_rng(15)
-    features_only = RsiIdentifier(refinement=False, zero_point=20.3)
+    features_only = RsiIdentifier(
+        refinement=False, zero_point=20.3, detected_limit=6.0, magnitude_sigma=0.03
+    )  # as in test_ablations, so that the errors are measured once
     attitude = random_attitude(rng)
     solution = features_only.identify(*points(rng, attitude, magnitude_sigma=0.02))
     exceeded = []
