@@ -54,11 +54,6 @@ def _telecommand(name: str, icd: InterfaceDefinition) -> Row:
     return icd.telecommands[name]
 
 
-def _image_size(name: str, icd: InterfaceDefinition) -> str:
-    icd.enums["image_size"].number(name)
-    return name
-
-
 def _refusal(name: str, icd: InterfaceDefinition) -> str:
     errors = icd.error_numbers
     if name not in errors:
@@ -114,7 +109,6 @@ Readable = Annotated[Row, _read_by(_readable)]
 Telecommand = Annotated[Row, _read_by(_telecommand)]
 ParameterName = Annotated[Parameter, _read_by(lambda name, icd: icd.parameters[name])]
 Refusal = Annotated[str, _read_by(_refusal)]
-ImageSize = Annotated[str, _read_by(_image_size)]
 HexBytes = Annotated[bytes, _read_by(_hex_bytes)]
 RawItem = Annotated[bytes | CanFrame, _read_by(_raw_item)]
 RawItems = Annotated[list[RawItem], BeforeValidator(_as_list), AfterValidator(_of_one_link)]

@@ -23,7 +23,6 @@ from starhil.hil_tests.session.step_keys import (
     Duration,
     FileName,
     HexBytes,
-    ImageSize,
     ParameterName,
     Patterns,
     RawItems,
@@ -252,9 +251,21 @@ class DownloadImage(Step):
 
     default_name = "download image {self.file}"
     file: FileName = Field(alias="download_image")
-    size: ImageSize = "size_128"
+    size: str = "size_128"
+    """A name of the enumeration `image_size`."""
     method: Literal["frames", "burst"] = "frames"
     """`frames` of 128 bytes, or `burst` packets with hole maps."""
+
+    def _problems(self, info: ValidationInfo) -> Iterator[str]:
+        yield from super()._problems(info)
+        icd = (info.context or {})["icd"]
+        if "save_image" not in icd.telecommands:
+            yield f"unit {icd.name} has no telecommand save_image: only images of CubeStar's kind can be downloaded"
+            return
+        try:
+            icd.enums["image_size"].number(self.size)
+        except ProtocolError as error:
+            yield f"size: {error}"
 
     def run(self, session: SessionState, link: str) -> Attempt:
         """Download the image; a blank one is a problem."""

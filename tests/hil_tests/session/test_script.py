@@ -123,6 +123,13 @@ def test_every_error_of_a_script_is_reported_with_its_place(load):
         assert word in line
 
 
+def test_an_image_of_a_unit_without_such_images_is_rejected(tmp_path):
+    path = tmp_path / "script.toml"
+    path.write_text("[[step]]\ndownload_image = 'i.png'\n")
+    with pytest.raises(ScriptError, match="step 1: unit st200 has no telecommand save_image: only images of"):
+        load_script(path, load_unit("st200"))
+
+
 def test_every_wrong_field_of_a_step_is_reported(load):
     with pytest.raises(ScriptError) as caught:
         load(
