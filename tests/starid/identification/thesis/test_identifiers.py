@@ -172,17 +172,16 @@ def test_rsi_follows_a_turning_sensor_among_false_stars():
 def test_errors_of_magnitudes_leave_the_region_useless():
     """Errors of 0.1 mag put stars on the wrong side of the limit of the features, those of 0.03 mag fewer."""
     images_in_region = [
-        [sequence_among_false_stars(seed, sigma)[1].in_region for seed in range(30, 38)]
+        [sequence_among_false_stars(seed, sigma)[1].in_region for seed in range(30, 36)]
         for sigma in (0.03, 0.1)
     ]
-    assert wilcoxon(*images_in_region, alternative="greater").pvalue < 0.05  # the same eight sequences
+    assert wilcoxon(*images_in_region, alternative="greater").pvalue < 0.05  # the same six sequences
 
 
 def test_while_the_features_disagree_the_whole_database_is_searched():
     rng = np.random.default_rng(15)
-    features_only = RsiIdentifier(
-        refinement=False, zero_point=20.3, detected_limit=6.0, magnitude_sigma=0.03
-    )  # as in test_ablations, so that the errors are measured once
+    # the options of test_ablations, whose errors are measured already
+    features_only = RsiIdentifier(refinement=False, zero_point=20.3, detected_limit=6.0, magnitude_sigma=0.03)
     attitude = random_attitude(rng)
     solution = features_only.identify(*points(rng, attitude, magnitude_sigma=0.02))
     exceeded = []
