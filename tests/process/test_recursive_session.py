@@ -23,6 +23,7 @@ def test_a_session_with_the_recursive_algorithm_passes(tmp_path, session):
     text = bundled("session")[session].read_text(encoding="utf-8")
     short, samples = re.subn(r"(?<=\bfor_s = )\d+", str(LONGEST_SAMPLE_S), text)
     assert samples == text.count("sample = {") > 0
+    short = short.replace("min_samples = 30", "min_samples = 10")  # of a third of the time
     script = tmp_path / f"{session}.toml"
     script.write_text(short, encoding="utf-8")
     done = starhil("session", script, "--start", "--can", "auto", "--log", tmp_path, "--json")

@@ -150,7 +150,7 @@ def test_42_in_lock_step_and_its_recording(tmp_path):
     assert figures["largest error of the attitude"][0] < 20.0
     assert figures["largest error of the rate"][0] < 0.01
     status, out, said = run_command_line("replay", str(tmp_path / "recorded"))
-    assert (status, said) == (0, "")
+    assert (status, [line for line in said.splitlines() if not line.startswith("compiling: ")]) == (0, [])
     assert "entries played: identical" in out
 
 
