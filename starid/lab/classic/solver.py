@@ -287,9 +287,8 @@ class ClassicIdentifier(VerifiedIdentifier):
             deviation = math.sqrt(2.0 * float(np.mean(sigmas[rows] ** 2)))
             tolerance_px = max(self.sigmas * deviation, _MIN_TOLERANCE_PX)
         directions = np.ascontiguousarray(directions[rows])
-        directions.setflags(
-            write=False
-        )  # as those of the guide stars, so that kernels are compiled for both at once
+        # read-only as those of the guide stars, so that kernels are compiled for both at once
+        directions.setflags(write=False)
         return Observed(directions, magnitude[:count], rows, tolerance_px / self._px_per_rad)
 
     def _raw(self, xy: Array, observed: Observed, pairs: Indices) -> Solution:
