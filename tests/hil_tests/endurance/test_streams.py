@@ -9,6 +9,7 @@ from starhil.emulator.cli.endurance import run_once
 from starhil.emulator.device.subscriptions import Subscriptions
 from starhil.emulator.launch.unit_in_memory import UnitUnderTest
 from starhil.hil_tests.endurance.life import Life, make_life
+from starhil.hil_tests.endurance.obc import Obc
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.judge.definition import read_unit
 from tests.test_docs import blocks
@@ -122,7 +123,7 @@ fields = [{ name = "mode", type = "u8", argument = "mode", map = { 1 = "standby"
 """
 
 
-def test_a_telecommand_is_answered_as_often_as_the_definition_says(tmp_path):
+def test_a_telecommand_is_answered_as_often_as_the_definition_says(tmp_path, monkeypatch):
     folder = user_unit(
         tmp_path / "unit", HEAD + TWO_ANSWERS + MODES_ON_TWO_LINKS.replace('unsolicited = ["mode"]\n', "")
     )
@@ -132,6 +133,9 @@ def test_a_telecommand_is_answered_as_often_as_the_definition_says(tmp_path):
     outcome = run_once(life)
     assert outcome.violation == ""
     assert outcome.readings == len(steps)
+    for answers, number in ((("reply",), 1), (("reply", "row:mode", "row:mode"), 3)):
+        monkeypatch.setattr(Obc, "_expected_answers", lambda *_, answers=answers: answers)
+        assert run_once(life).violation == f"serial: measure 01: 2 answers, not {number}"
 
 
 MODES_ON_TWO_LINKS = """
