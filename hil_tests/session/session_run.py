@@ -95,7 +95,8 @@ def run_session(request: SessionRequest) -> SessionResult:
         prepare_report(request.junit)
     console = Console(highlight=False, quiet=request.quiet)
     console.print(Text(escape_controls(script.title), style="bold"))
-    if not request.start and request.control is request.truth is None and _asks_for_an_emulator(script):
+    unconfirmed = not request.start and request.control is None and request.truth is None
+    if unconfirmed and _asks_for_an_emulator(script):
         hint = "This session expects the emulator that --start starts (--control ADDRESS checks it). To start it by hand: "
         hint += start_command(script, folder)
         console.print(Text(escape_controls(hint), style="yellow"), soft_wrap=True)
