@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib
 import logging
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -130,7 +131,7 @@ class DeviceOptions:
     symlink: Annotated[
         Path | None,
         Key("links.serial.symlink", _symlink),
-        typer.Option(help="Symbolic link to the pty; removed at the end."),
+        typer.Option(help="Symbolic link to the pty, from the ready line to the end."),
     ] = None
     orbit: OrbitChoice = None
     settings: Settings = None
@@ -284,7 +285,7 @@ def command(
     """Run the emulator until SIGINT, SIGTERM or SIGHUP.
 
     When the emulator accepts commands, it prints a line on stdout that gives the links:
-    `ready serial=… dialect=… can=… seed=…`. The exit status is 1 if a log, a recording or the state could not be
+    `ready serial=… can=… unit=… profile=… seed=…`. The exit status is 1 if a log, a recording or the state could not be
     written, for example because the disk is full; the run goes on without it.
     """
     from starhil.emulator.sensor.pipeline.worker_process import take_worker
@@ -317,6 +318,13 @@ def command(
             "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
         )
     options = around.run_options()
+    for each in profiles:
+        if unit := each.lent_to:
+            print(
+                f"note: camera, sensor and parameters of the unit {unit} are those of the profile {each.name_or_path}; give a "
+                "profile of your own to change them (starhil docs profile)",
+                file=sys.stderr,
+            )
     return run_loop(_serve(lambda: Emulator(profiles, options, worker)))
 
 

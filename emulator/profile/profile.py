@@ -47,7 +47,7 @@ from starhil.emulator.truth.config import (
     profile_paths,
 )
 from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError, remedy
-from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled_units, find, not_found
+from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled, bundled_units, find, not_found
 from starhil.protocol.files.user_file import TomlError, parse_toml
 from starhil.protocol.files.validation import TableOf, problems
 from starhil.protocol.unit import load_unit
@@ -176,6 +176,19 @@ class Profile(Strict):
     def source(self) -> str:
         """File of the profile, or its name if there is none, for messages."""
         return self.name if self._source is None else str(self._source)
+
+    @property
+    def name_or_path(self) -> str:
+        """What loads the profile again: name of a bundled profile, or path of a file."""
+        path = self._source
+        return path.stem if path is not None and bundled("profile").get(path.stem) == path else self.source
+
+    @property
+    def lent_to(self) -> str:
+        """The unit to which an option gives a bundled profile of another one; empty if it is nobody else's."""
+        files = [values for source, values in self._layers if source.startswith("profile ")]
+        own = next((values["unit"] for values in reversed(files) if "unit" in values), DEFAULT_UNIT)
+        return "" if self.unit == own or self.name_or_path not in bundled("profile") else self.unit_source
 
     @property
     def unit_source(self) -> str:

@@ -111,14 +111,13 @@ class DeviceConfig(Strict):
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Number of valid frames from which the body rate is estimated, if the star identifier does not do so."""
     tracking_stars: Literal[0] | Annotated[int, Field(ge=2, le=50)] = 2
-    """Least number of matched stars in tracking, where the predicted attitude verifies few stars, which may then be fainter
-    (3 sigmas). 0: `min_stars_matched`, as lost in space."""
+    """Least number of matched stars in tracking; 0: `min_stars_matched`, as lost in space."""
     largest_error_deg: Annotated[float, Field(ge=0.001, le=10.0)] = 0.1
-    """Largest error across or about the boresight that an attitude may have, degrees: it is invalid if, by its own uncertainty, a
-    larger one is likelier than 1e-4. With few stars in tracking, that includes errors of the prediction that the stars do not show."""
+    """Largest error across or about the boresight: an attitude is invalid if, by its own uncertainty, a larger one is likelier
+    than 1e-4."""
     wrong_predictions: Annotated[float, Field(ge=0.0, le=1.0)] = 0.001
-    """Share of the predicted attitudes that are assumed to be wrong by more than their uncertainty, because the body accelerates. The
-    larger it is, the more stars an attitude in tracking needs."""
+    """Share of the predicted attitudes that are assumed to be wrong, because the body accelerates. The larger it is, the more
+    stars an attitude in tracking needs."""
     tracking_windows: bool = False
     """Whether the unit searches only windows around the predicted stars when it tracks, and the whole image only if that fails."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
@@ -293,7 +292,7 @@ class SerialConfig(Strict):
     pace: bool = True
     """Whether a message arrives, whole, only at the time at which its last byte would at the bit rate."""
     symlink: UserPath = ""
-    """Path of a symbolic link to the pty, created at the start and removed at the end."""
+    """Path of a symbolic link to the pty, made when the unit is ready, removed at the end."""
 
 
 class CanConfig(Strict):

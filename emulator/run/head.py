@@ -224,7 +224,7 @@ class Head:
             self._pump.start()
 
     async def ready(self) -> dict[str, str]:
-        """Wait until the device accepts commands; return the fields of the ready line."""
+        """Wait until the device accepts commands, and publish its ports; return the fields of the ready line, without blanks."""
         awake = asyncio.create_task(self._awake.wait())
         warm_up = self._warm_up_task
         if warm_up is None:
@@ -234,9 +234,17 @@ class Head:
             awake.cancel()
             raise error
         await awake
-        unit = quote(self.profile.unit_source, safe="/:.~")  # a field has no blanks
-        orbit = "none" if self.profile.orbit is None else self.profile.orbit.kind
-        return {**self.ready_fields, "unit": unit, "seed": str(self.profile.run.seed), "orbit": orbit}
+        for link in self.links.values():
+            link.transport.publish()
+        profile = self.profile
+        chosen = {
+            "unit": profile.unit_source,
+            "unit_version": self.icd.version,
+            "profile": profile.name_or_path,
+            "seed": str(profile.run.seed),
+            "orbit": "none" if profile.orbit is None else profile.orbit.kind,
+        }
+        return self.ready_fields | {key: quote(value, safe="/:.~") for key, value in chosen.items()}
 
     async def close(self) -> None:
         """Close everything, even if closing one of them fails, which is logged."""

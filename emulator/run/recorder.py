@@ -150,6 +150,9 @@ class _RecordedTransport(Transport[Item]):
 
         self._recorder.when_open(entry)
 
+    def publish(self) -> None:
+        self._inner.publish()
+
     def send(self, item: Item) -> bool:
         self._recorder.write(LinkItem, do="out", link=self._name, data=LinkItem.data_of(item))
         return self._inner.send(item)

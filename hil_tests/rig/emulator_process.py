@@ -27,7 +27,9 @@ READY_WITHIN_S: Final = 300.0
 STOP_WITHIN_S: Final = 60.0
 """It takes a moment, and much longer on a machine that is busy with everything else."""
 PROGRESS: Final = "starting:"
-"""Begin of the lines on stderr that report the progress of a slow start; they are shown."""
+"""Begin of the lines on stderr that report the progress of a slow start."""
+SHOWN: Final = (PROGRESS, "note:")
+"""Begins of the lines on stderr that are shown as they come: they are no errors."""
 BAD_INPUT: Final = 2
 """Exit status of an emulator that rejects an option, its profile or its unit."""
 REJECTED: Final = "starhil: "
@@ -213,7 +215,7 @@ class EmulatorProcess:
 
     def _read_errors(self, stream: IO[str]) -> None:
         for line in stream:
-            if line.startswith(PROGRESS):
+            if line.startswith(SHOWN):
                 print(line.rstrip(), file=sys.stderr, flush=True)
                 self._lines.put(line)
             else:

@@ -23,10 +23,12 @@ from starhil.hil_tests.rig.interruption import Interrupted
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from starhil.hil_tests.rig.rig import LinkOptions, Rig, links_to_use
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
+from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.expect import show_angle
 from starhil.hil_tests.session.results import SessionResult, StepResult, junit_cases
 from starhil.hil_tests.session.script import Script, load_script
 from starhil.hil_tests.session.session import run_steps
+from starhil.hil_tests.session.step import BOOTING
 from starhil.hil_tests.session.steps import Control, Listen
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.files.bundled import DEFAULT_UNIT, find, not_found
@@ -86,6 +88,8 @@ def run_session(request: SessionRequest) -> SessionResult:
         script.defaults.keep_going = True
     options = _options(request, script)
     _check_steps(path, script, icd, options.links, request)
+    if request.truth is not None:
+        TruthLogReader(request.truth).check()
     folder = request.folder or DEFAULT_FOLDER / path.stem
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -165,8 +169,10 @@ def _check_emulator(path: Path, script: Script, rig: Rig, folder: Path) -> None:
         key, _, value = setting.partition("=")
         if key in present and (found := status[present[key]]) != value.strip("\"'"):
             problems.append(f"its {key} is {found}, not {value}")
-    if status["mode"] in ("boot", "error"):
-        problems.append(f"its mode is {status['mode']}")
+    if status["mode"] == "boot":
+        problems.append(BOOTING)
+    elif status["mode"] == "error":
+        problems.append("its mode is error")
     if script.truth.attitude is not None:
         truth = unit(rig.control("truth", {})["quaternion_xyzw"])
         off = attitude_error(truth, script.truth.attitude).total_arcsec

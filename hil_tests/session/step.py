@@ -34,6 +34,8 @@ from starhil.protocol.icd.values import Value
 
 MS_PER_S: Final = 1e3
 
+BOOTING: Final = "the unit boots; an emulator does so until it prints its ready line, for minutes while it compiles kernels"
+
 Answer = TypeVar("Answer", Ack, Reading)
 
 
@@ -181,8 +183,16 @@ class Step(Keys):
                 attempt.figures.update(vars(error))
                 attempt.detail += f" error: {show_angle(error.cross_boresight_arcsec)} cross, {show_angle(error.roll_arcsec)} roll"
             problems += [] if problem is None else [problem]
+        if problems and _boots(self.reading, reading.values):
+            problems.append(BOOTING)
         attempt.problem = "; ".join(problems) or None
         return attempt
+
+
+def _boots(row: Row | None, values: Mapping[str, Value]) -> bool:
+    """Return whether a row reports that the unit boots."""
+    fields = {} if row is None else row.named_fields
+    return any(field.value == "mode" and values.get(name) == "boot" for name, field in fields.items())
 
 
 class RequestStep(Step):

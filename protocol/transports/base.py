@@ -75,6 +75,12 @@ class Transport(ABC, Generic[Item]):
     async def _open(self) -> None:
         """Open the port or raise TransportError."""
 
+    def publish(self) -> None:
+        """Let peers find the open port under its other name, if it has one.
+
+        Raises TransportError: the name is not available.
+        """
+
     @abstractmethod
     def send(self, item: Item) -> bool:
         """Queue an item without blocking. Returns False if it was dropped; drops are counted."""

@@ -115,11 +115,39 @@ def _watch(path: str) -> int:
     return events
 
 
+def _free_name(link: Path) -> None:
+    """Remove a symlink that an earlier run has left, and check that another can be made in its place."""
+    if link.exists() and not link.is_symlink():
+        raise TransportError(f"serial: {link} exists and is not a symlink; choose another name")
+    with _beside(link) as temporary:
+        temporary.symlink_to(link.name)
+    link.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _beside(link: Path) -> Iterator[Path]:
+    """Give the path of a temporary file in the folder of a symlink, and leave nothing there."""
+    temporary = link.with_name(f".{link.name}.{os.getpid()}")
+    try:
+        yield temporary
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _symlink_errors(link: Path) -> Iterator[None]:
+    """Report that a symlink cannot be made, such as one of another user in /tmp."""
+    try:
+        yield
+    except OSError as error:
+        raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
+
+
 class PtyTransport(PacedTransport):
     """A new pseudo-terminal; peers open its slave side like any tty, as often as they want.
 
     As on a wire, bytes sent while no peer has the slave side open are lost; so are bytes that a peer has not
-    read when it leaves.
+    read when it leaves. The symlink is made by `publish` and removed by `close`.
     """
 
     def __init__(self, pace: int | None, symlink: Path | None) -> None:
@@ -145,7 +173,8 @@ class PtyTransport(PacedTransport):
             os.set_blocking(self._master, False)
             self._path = os.ttyname(slave)
             if self._symlink is not None:
-                self._make_symlink(self._symlink, self._path)
+                with _symlink_errors(self._symlink):
+                    _free_name(self._symlink)
         except (OSError, TransportError) as error:
             os.close(self._master)
             if isinstance(error, TransportError):
@@ -157,19 +186,13 @@ class PtyTransport(PacedTransport):
         self._peers = PtyPeers(self._master, self._path)
         asyncio.get_running_loop().add_reader(self._peers.fileno(), self._woken)
 
-    def _make_symlink(self, link: Path, path: str) -> None:
-        try:
-            if link.exists() and not link.is_symlink():
-                raise TransportError(f"serial: {link} exists and is not a symlink; choose another name")
-            temporary = link.with_name(f".{link.name}.{os.getpid()}")
-            temporary.symlink_to(path)
-            try:
-                temporary.replace(link)
-            except OSError:  # the link of another user in /tmp, for example
-                temporary.unlink(missing_ok=True)
-                raise
-        except OSError as error:
-            raise TransportError(f"serial: cannot make the symlink {link}: {error.strerror}") from None
+    def publish(self) -> None:
+        """Make the symlink, atomically."""
+        if self._symlink is None:
+            return
+        with _symlink_errors(self._symlink), _beside(self._symlink) as temporary:
+            temporary.symlink_to(self._path)
+            temporary.replace(self._symlink)
 
     def _woken(self) -> None:
         """Note a wake-up; each write of a peer causes one, and stands for all waiting data."""

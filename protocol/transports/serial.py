@@ -45,7 +45,7 @@ def open_serial(
     baud:
         Bit rate, 8N1, for the pacing and for the hardware of a real tty.
     symlink:
-        Path of a symlink to the pseudo-terminal; created atomically, removed on close.
+        Path of a symlink to the pseudo-terminal; `publish` makes it, `close` removes it.
     paced:
         Whether a message is passed on, whole, only when its last byte would have arrived at the bit rate; true
         by default, except for a real tty, which is paced by its hardware.
@@ -178,7 +178,10 @@ def _tty_problem(path: str, baud: int, error: Exception) -> str:
     if number in (errno.EBUSY, errno.EAGAIN):
         return f"serial {path}: busy: another program has it open; close that program"
     if number == errno.ENOENT:
-        return f"serial {path}: no such port; plug the adapter in, or name another (auto makes a pseudo-terminal)"
+        return (
+            f"serial {path}: no such port; plug the adapter in, wait for the ready line of the emulator, or name another "
+            "(auto makes a pseudo-terminal)"
+        )
     if number == errno.EACCES:
         return f"serial {path}: no permission; join the group that owns it (often dialout)"
     return f"serial {path}: cannot open: {os.strerror(number) if number else error}"

@@ -125,6 +125,11 @@ def test_a_symlink_leads_to_the_port(stepped):
     assert stepped.link.is_symlink()
 
 
+def test_the_ready_line_names_profile_and_unit_with_its_version(stepped):
+    chosen = {key: stepped.ready[key] for key in ("unit", "unit_version", "profile")}
+    assert chosen == {"unit": "cubestar", "unit_version": ICD.version, "profile": "ideal"}
+
+
 def test_the_real_sky_gives_the_true_attitude(stepped):
     stepped.do("clear_faults")
     stepped.do(
@@ -305,6 +310,16 @@ def test_bad_input_ends_in_one_line_and_status_2(arguments, said, worker):
 
 def test_a_catalogue_that_the_pipeline_cannot_read_ends_in_one_line_and_status_2():
     check_rejected(["--set", "catalog.path=/no/such/file"], "/no/such/file")
+
+
+def test_a_profile_that_is_not_for_the_unit_is_noted():
+    status, _, err = run_command_line("run", "--can", "off", "--serial", "/dev/no_such_tty", "--unit", "nos3")
+    note, error = log_lines(err)
+    assert note == (
+        "note: camera, sensor and parameters of the unit nos3 are those of the profile cubestar; give a profile of your own to "
+        "change them (starhil docs profile)"
+    )
+    assert (status, error[:9]) == (2, "starhil: ")
 
 
 def check_rejected(arguments, message):

@@ -38,3 +38,22 @@ def test_a_start_rehearses_a_frame_with_the_parameters(run, prepared):
         assert len(prepared) == 1
 
     run(scenario, clock="real")
+
+
+def test_the_symlink_to_the_port_is_made_when_the_unit_answers(run, prepared, tmp_path, monkeypatch):
+    """A session found it minutes before, while kernels were compiled, and met a unit that went on booting."""
+    link, before = tmp_path / "tty", []
+    link.symlink_to("/dev/pts/99999")
+    settle = FakeImager.settle
+
+    async def settled(self):
+        await settle(self)
+        before.extend(tmp_path.iterdir())
+
+    async def scenario(_emulation, line):
+        assert f"serial={link} " in line
+        assert link.readlink().exists()
+
+    monkeypatch.setattr(FakeImager, "settle", settled)
+    run(scenario, clock="real", links={"serial": {"port": "auto", "symlink": str(link)}})
+    assert before == []

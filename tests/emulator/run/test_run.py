@@ -268,7 +268,7 @@ def test_an_empty_name_of_a_profile_or_unit_is_not_the_working_folder(tmp_path, 
         (
             RunOptions(),
             {"links": {"can": {"channel": "off"}, "serial": {"port": "/dev/no_such"}}},
-            r"serial /dev/no_such: no such port; plug the adapter in, or name another \(auto makes a pseudo-terminal\)",
+            r"serial /dev/no_such: no such port; plug the adapter in, wait for the ready line of the emulator, or .+",
         ),
         (
             RunOptions(),

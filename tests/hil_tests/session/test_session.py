@@ -25,7 +25,8 @@ from starhil.hil_tests.session import SessionRequest, run_session
 from starhil.hil_tests.session.results import junit_cases
 from starhil.hil_tests.session.script import load_script
 from starhil.hil_tests.session.session import run_steps
-from starhil.hil_tests.session.session_run import _emulator, _print_result, _running_step
+from starhil.hil_tests.session.session_run import _emulator, _print_result, _running_step, find_script
+from starhil.hil_tests.session.step import BOOTING
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.unit import load_unit
 from starid.errors import StaridError
@@ -279,6 +280,18 @@ def test_a_truth_log_that_is_given_takes_the_place_of_the_truth_of_the_script(de
             assert result.results[0].status == status
 
 
+def test_a_truth_log_that_is_missing_is_rejected_before_the_emulator_starts(tmp_path):
+    truth = tmp_path / "missing.csv"
+    request = SessionRequest(
+        find_script("first_light"), LinkOptions(), start=True, folder=tmp_path / "log", truth=truth
+    )
+    with pytest.raises(
+        BenchError, match=r"missing\.csv: the truth cannot be read: No such file or directory"
+    ):
+        run_session(request)
+    assert not (tmp_path / "log").exists()
+
+
 @pytest.mark.parametrize("own", ["", "truth.kind=rate"])
 def test_the_truth_of_a_script_points_the_emulator_that_is_started(own, tmp_path):
     path = tmp_path / "trial.toml"
@@ -317,6 +330,12 @@ def test_an_invalid_attitude_never_passes(play, device):
     result = play(TRUTH + "[[step]]\nread = 'precise_attitude'\nattitude = { within_arcsec = 1e9 }")
     assert "no_match" in result.results[0].detail
     assert not result.passed
+
+
+def test_a_unit_that_boots_is_explained_where_an_expectation_fails(play, device):
+    device.telemetry["device_status"] = {"mode": "boot"}
+    result = play("[[step]]\nread = 'device_status'\nexpect = { mode = 'standby' }")
+    assert result.results[0].detail == f"mode is boot, expected standby; {BOOTING}"
 
 
 def test_a_step_is_retried_until_it_passes_or_times_out(play, device):

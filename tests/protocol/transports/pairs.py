@@ -63,6 +63,7 @@ async def serial_pair(kind: str, tmp_path: Path, baud: int = 921600) -> AsyncIte
     one = open_serial(specs[0], baud, symlink=link if specs[1] else None)
     pair = SerialPair(one, one)
     await pair.start(one, pair.got_one)
+    one.publish()
     pair.two = open_serial(specs[1] or one.description, baud)
     await pair.start(pair.two, pair.got_two)
     try:

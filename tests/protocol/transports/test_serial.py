@@ -159,6 +159,7 @@ def test_a_vanished_port_is_reported_once_and_reopened(tmp_path: Path) -> None:
             again = open_serial("pty", symlink=link)
             got = bytearray()
             await again.start(got.extend)
+            again.publish()
             await until(lambda: pair.two.statistics.reconnects == 1)
             pair.two.send(b"hello again")
             await until(lambda: bytes(got) == b"hello again")
@@ -251,20 +252,23 @@ def test_pyserial_opens_our_pseudo_terminal_and_our_socket(tmp_path: Path) -> No
         for spec, link in (("pty", tmp_path / "star"), ("listen://127.0.0.1:0", None)):
             transport = open_serial(spec, symlink=link)
             await transport.start(transport.send)
+            transport.publish()
             assert await asyncio.to_thread(echo, transport.description) == b"\x1f\x7f\x80\x1f\xff"
             await transport.close()
 
     asyncio.run(main())
 
 
-def test_the_symlink_replaces_a_stale_one_and_is_removed_at_close(tmp_path: Path) -> None:
+def test_the_symlink_replaces_a_stale_one_once_published_and_is_removed_at_close(tmp_path: Path) -> None:
     async def main() -> None:
         link = tmp_path / "tty"
         link.symlink_to("/nowhere")
         transport = open_serial("auto", symlink=link)
         await transport.start(lambda _: None)
-        assert os.path.realpath(link).startswith("/dev/pts/")
         assert transport.description == str(link)
+        assert list(tmp_path.iterdir()) == []
+        transport.publish()
+        assert os.path.realpath(link).startswith("/dev/pts/")
         await transport.close()
         await transport.close()
         assert list(tmp_path.iterdir()) == []
@@ -279,8 +283,12 @@ def test_a_symlink_that_cannot_be_replaced_leaves_nothing(
     link = tmp_path / "tty"
     link.symlink_to("/nowhere")
 
-    def not_permitted(*_arguments: object) -> None:
-        raise PermissionError(1, "Operation not permitted")
+    removed = type(link).unlink
+
+    def not_permitted(path: Path, *, missing_ok: bool = False) -> None:
+        if path == link:
+            raise PermissionError(1, "Operation not permitted")
+        removed(path, missing_ok=missing_ok)
 
     async def main() -> None:
         transport = open_serial("auto", symlink=link)
@@ -288,7 +296,7 @@ def test_a_symlink_that_cannot_be_replaced_leaves_nothing(
             await transport.start(lambda _: None)
         await transport.close()
 
-    monkeypatch.setattr(type(link), "replace", not_permitted)
+    monkeypatch.setattr(type(link), "unlink", not_permitted)
     asyncio.run(main())
     assert list(tmp_path.iterdir()) == [link]
 
@@ -297,8 +305,9 @@ def test_a_symlink_taken_over_by_another_is_left_alone(tmp_path: Path) -> None:
     async def main() -> None:
         link = tmp_path / "tty"
         one, two = open_serial("pty", symlink=link), open_serial("pty", symlink=link)
-        await one.start(lambda _: None)
-        await two.start(lambda _: None)
+        for transport in (one, two):
+            await transport.start(lambda _: None)
+            transport.publish()
         await one.close()
         assert link.is_symlink()
         await two.close()
@@ -502,6 +511,7 @@ def test_a_rate_set_before_the_port_is_open_is_the_rate_at_which_it_opens(tmp_pa
     async def main() -> None:
         one = open_serial("pty", symlink=tmp_path / "tty")
         await one.start(lambda _: None)
+        one.publish()
         two = open_serial(str(tmp_path / "tty"), 9600)
         two.set_baud(19200)
         await two.drain()
