@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
-from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -20,12 +20,10 @@ from starhil.emulator.cli.options import Jobs, OrbitChoice, Seed, Settings, name
 from starhil.emulator.cli.output import compiles
 from starid.camera import DEFAULT_FOV_DEG
 from starid.cli.options import AsJson
-from starid.cli.output import Column, print_table
+from starid.cli.output import Column, print_table, progress_shown
 from starid.storage.child_processes import importing_only_what_is_installed
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
-
     from starhil.emulator.benchmarks.campaign import CampaignPlan
     from starhil.emulator.benchmarks.ecss_campaign import EcssPlan
 
@@ -399,9 +397,9 @@ def algorithms(
 
     plan = AlgorithmPlan(profile, frames, seed, tuple(with_orbit(setting, orbit)), checked_part(part))
     scenes = SCENES[:1] if lost_only else tuple(each for each in SCENES if (scene or "") in each.name)
-    with _progress() as bar:
-        task = bar.add_task("campaign", total=sum(each.images(frames) for each in scenes))
-        rows = list(run_algorithms(plan, scenes, partial(bar.advance, task)))
+    total, done = sum(each.images(frames) for each in scenes), itertools.count(1)
+    with progress_shown("campaign") as show:
+        rows = list(run_algorithms(plan, scenes, lambda: show(next(done), total)))
     if as_json:
         print(json.dumps(rows))
     else:
@@ -543,13 +541,8 @@ def _warn(plan: EcssPlan) -> None:
 
 
 def _with_progress(chunks: Iterable[Any], total: int) -> Iterator[Any]:
-    """Show a progress bar on stderr while iterating over the chunks."""
-    with _progress() as bar:
-        yield from bar.track(chunks, total, description="campaign")
-
-
-def _progress() -> Progress:
-    from rich.console import Console
-    from rich.progress import Progress
-
-    return Progress(console=Console(stderr=True))
+    """Show on stderr how many chunks are done while iterating over them."""
+    with progress_shown("campaign") as show:
+        for done, chunk in enumerate(chunks, 1):
+            show(done, total)
+            yield chunk

@@ -14,7 +14,7 @@ from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import BenchOptions, OrbitChoice, Settings, checked_dialect, with_orbit
 from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starid.cli.options import AsJson
-from starid.cli.output import output_help
+from starid.cli.output import output_help, progress_shown
 
 if TYPE_CHECKING:
     from starhil.hil_tests.conformance.conformance_run import ConformanceRequest
@@ -153,7 +153,6 @@ def command(
     received data.
     """
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     from starhil.hil_tests.conformance import report
     from starhil.hil_tests.conformance.conformance_run import requested_cases, run_conformance
@@ -175,17 +174,13 @@ def command(
     for path in (junit, html):
         if path is not None:
             prepare_report(path)
-    with (
-        interruptible(),
-        Progress(
-            BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"),
-            console=console, transient=True, disable=not console.is_terminal or as_json,
-        ) as progress,
-    ):  # fmt: skip
-        bar = progress.add_task("starting" if request.start else "", total=len(requested))
+    with interruptible(), progress_shown("conformance", None if as_json else console) as show_progress:
+        done = 0
 
         def show(outcome: Outcome) -> None:
-            progress.update(bar, advance=outcome.status != NOT_RUN, description=outcome.id)
+            nonlocal done
+            done += outcome.status != NOT_RUN
+            show_progress(done, len(requested), outcome.id)
             report.print_outcome(console, outcome, verbose=verbose)
 
         result = run_conformance(request, show)

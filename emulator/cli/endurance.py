@@ -25,6 +25,7 @@ from starhil.emulator.cli.output import compiles
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.files.bundled import bundled_units
 from starid.cli.options import AsJson
+from starid.cli.output import progress_shown
 from starid.storage.child_processes import importing_only_what_is_installed
 
 IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made there)
@@ -120,9 +121,6 @@ def command(
 
 def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
     """Run the lives of a plan in processes, until its end or that of the time."""
-    from rich.console import Console
-    from rich.progress import Progress
-
     context = get_context("spawn")
     try:
         with importing_only_what_is_installed():
@@ -137,9 +135,8 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
     with (
         importing_only_what_is_installed(),
         ProcessPoolExecutor(plan.jobs, mp_context=context) as pool,
-        Progress(console=Console(stderr=True)) as progress,
+        progress_shown("endurance, lives" if limit_s is None else "endurance, seconds") as show,
     ):
-        task = progress.add_task("endurance", total=limit_s or plan.lives)
         running: set[Future[dict[str, Any]]] = set()
         done = 0
         while True:
@@ -150,7 +147,7 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
                 return
             ended, running = wait(running, return_when=FIRST_COMPLETED)
             done += len(ended)
-            progress.update(task, completed=done if limit_s is None else time.monotonic() - begin)
+            show(*((done, plan.lives) if limit_s is None else (time.monotonic() - begin, limit_s)))
             for future in ended:
                 yield future.result()
 

@@ -23,7 +23,7 @@ from starid.cli.frame_options import (
     frame_parameters,
 )
 from starid.cli.options import AsJson
-from starid.cli.output import output_help, prepare_output, report_stream
+from starid.cli.output import output_help, prepare_output, progress_shown, report_stream
 
 group = typer.Typer(
     help="Build or inspect databases of the LSI and RSI algorithms: feature vectors of overlapping patches of the sky.",
@@ -54,9 +54,6 @@ def build(
     as_json: AsJson = False,
 ) -> None:
     """Build a feature database."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
     from starid.identification.thesis.database import build_database
     from starid.identification.thesis.database_file import save_database
 
@@ -72,18 +69,9 @@ def build(
         overlap_percent=overlap,
     )
     catalog = frame_catalog(geometry, epoch)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %"),
-        TimeRemainingColumn(),
-    )
     start = time.perf_counter()
-    with Progress(*columns, console=Console(stderr=True), disable=as_json or not sys.stderr.isatty()) as bar:
-        task = bar.add_task("frames")
-        database = build_database(
-            catalog, parameters, progress=lambda done, total: bar.update(task, completed=done, total=total)
-        )
+    with progress_shown("frames") as show:
+        database = build_database(catalog, parameters, progress=show)
     seconds = time.perf_counter() - start
     result: dict[str, object] = {
         "cells": database.cells,

@@ -10,10 +10,20 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final, TextIO, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Protocol, TextIO, TypeAlias
 
 from starid.errors import StaridError
 from starid.storage.files import check_links, is_stdout
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+class ShowProgress(Protocol):
+    """Shows how much is done of how much, and what is being done."""
+
+    def __call__(self, done: float, total: float, name: str = ...) -> None: ...
+
 
 Column: TypeAlias = tuple[str, Callable[[Any], str]]
 """Heading of a column, and the function that formats a row for it."""
@@ -148,6 +158,44 @@ def prepare_folder(path: Path, option: str) -> None:
 def report_stream(output: Path | None) -> TextIO:
     """Return the stream for the report of a command: stderr if its output file is stdout, or else stdout."""
     return sys.stderr if output is not None and is_stdout(output) else sys.stdout
+
+
+@contextmanager
+def progress_shown(work: str, console: Console | None = None) -> Iterator[ShowProgress]:
+    """Show how much of some work is done: by a bar on a terminal, otherwise by a line on stderr every `LOG_S`.
+
+    Gives a function of what is done, how much there is, and, if this changes, the name of what is being done. The bar is on
+    stderr, or on the console that the results are printed on.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = console or Console(stderr=True)
+    if not console.is_terminal:
+        begin_s = reported_s = time.monotonic()
+
+        def print_line(done: float, total: float, name: str = work) -> None:
+            nonlocal reported_s
+            now_s = time.monotonic()
+            if now_s - reported_s >= LOG_S:
+                reported_s = now_s
+                print(
+                    f"{name}: {done:.0f} of {total:.0f} after {now_s - begin_s:.0f} s",
+                    file=sys.stderr,
+                    flush=True,
+                )
+
+        yield print_line
+        return
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.description}", markup=False),
+    )
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(work, total=None)
+        yield lambda done, total, name=work: bar.update(task, completed=done, total=total, description=name)
 
 
 def progress() -> Callable[[str], None]:

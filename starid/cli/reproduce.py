@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import time
 from importlib import import_module
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Annotated
 import typer
 
 from starid.cli.options import AsJson
-from starid.cli.output import prepare_folder
+from starid.cli.output import prepare_folder, progress_shown
 
 
 def command(
@@ -41,9 +40,6 @@ def command(
     The report covers all finished experiments in the folder. The exit status is 1 if a check fails that is
     not known to fail; the report shows every failure.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from starid.lab.experiments.registry import experiments, select
     from starid.lab.experiments.report import CLASSES, summary, write_report
     from starid.lab.experiments.runner import finished_in, run
@@ -55,18 +51,14 @@ def command(
     import_module("matplotlib")  # before the work
     prepare_folder(output, "-o")
     start = time.perf_counter()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=as_json or not sys.stderr.isatty()) as bar:
-        task = bar.add_task("starting", total=None)
+    with progress_shown("starting") as show:
         results = run(
             selection,
             output,
             quick=quick,
             seed=seed,
             jobs=jobs,
-            progress=lambda name, done, total: bar.update(
-                task, description=name, completed=done, total=total
-            ),
+            progress=lambda name, done, total: show(done, total, name),
         )
     everything = finished_in(output, list(experiments().values()), quick=quick, seed=seed)
     report = write_report(everything, output, quick=quick, seed=seed)

@@ -15,11 +15,12 @@ from typing import Any
 
 import pytest
 import typer
+from rich.console import Console
 
 from starhil.emulator.cli import app, output
 from starid.cli import app as library
 from starid.cli import command_line
-from starid.cli.output import show_every_character
+from starid.cli.output import progress_shown, show_every_character
 from starid.errors import StaridError
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.workers import WORKER
@@ -231,6 +232,23 @@ def test_what_a_command_compiles_is_reported(
         rf"compiling: \d+ s, kernels added to the cache: {number}; later runs use them\n" for number in (1, 2)
     )
     assert re.fullmatch("".join(lines), capsys.readouterr().err)
+
+
+def test_progress_is_a_line_at_a_time_in_a_log_and_a_bar_on_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`endurance` ran for an hour in silence."""
+    for interval_s, expected in ((3600.0, ""), (0.0, "lives: 1 of 3 after 0 s\nlife 2: 2 of 3 after 0 s\n")):
+        monkeypatch.setattr("starid.cli.output.LOG_S", interval_s)
+        with progress_shown("lives") as show:
+            show(1, 3)
+            show(2, 3, "life 2")
+        assert capsys.readouterr() == ("", expected)
+    terminal = Console(file=io.StringIO(), force_terminal=True, color_system=None, width=60)
+    with progress_shown("lives", terminal) as show:
+        show(1, 3)
+    assert re.search(r"1/3 .*lives", terminal.file.getvalue())
+    assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
