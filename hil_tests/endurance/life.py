@@ -185,40 +185,50 @@ class LifeGenerator:
         self._clock_rows = [row for row in self._telecommands if row.action == "set_clock"]
         self._mode_rows = [row for row in self._telecommands if row.action == "set_mode"]
         self._command_weights = [ACTION_WEIGHTS.get(row.action or "", 1.0) for row in self._telecommands]
-        everything: list[tuple[float, Callable[[], Step]]] = [
-            (30, self._wait),
-            (16, self._read_any),
-            (16, self._read_attitude),
-            (18, self._command),
-            (6, self._invalid),
-            (8, self._mode),
-            (2, self._burst),
-            (2, self._junk),
-            (1, self._cut),
-            (2, self._stream),
-            (1, self._nmt),
-            (5, self._truth),
-            (4, self._fault),
-            (8, lambda: {"do": "clear"}),
-            (3, self._power),
-            (0.5, lambda: {"do": "end_pipeline"}),
-            (1, lambda: {"do": "disk", "full": self._random.random() < 0.5}),
-            (0.5, self._peer),
-            (2, lambda: {"do": "recover"}),
+        harmless = [row for row in self._telecommands if row.action == "nothing"]
+        self._flood_rows = [
+            min(kind, key=lambda row: row.size) for kind in (self._telemetry, harmless) if kind
         ]
-        left_alone: list[tuple[float, Callable[[], Step]]] = [
-            (22, self._long_wait),
-            (10, self._read_any),
-            (20, self._read_attitude),
-            (20, self._read_count),
-            (12, self._mode),
-            (3, self._flood),
-            (5, self._truth),
-            (6, self._clock),
+        """The shortest request of each kind that changes nothing."""
+        self._rows = [*self._telecommands, *self._telemetry]
+        always = True
+        everything: list[tuple[float, Callable[[], Step], object]] = [
+            (30, self._wait, always),
+            (16, self._read_any, self._telemetry),
+            (16, self._read_attitude, self._attitude_rows),
+            (18, self._command, self._telecommands),
+            (6, self._invalid, self._rows),
+            (8, self._mode, self._mode_rows),
+            (2, self._burst, self._telemetry),
+            (2, self._junk, always),
+            (1, self._cut, self._rows),
+            (2, self._stream, self._stream_rows),
+            (1, self._nmt, "canopen" in links),
+            (5, self._truth, always),
+            (4, self._fault, always),
+            (8, lambda: {"do": "clear"}, always),
+            (3, self._power, always),
+            (0.5, lambda: {"do": "end_pipeline"}, always),
+            (1, lambda: {"do": "disk", "full": self._random.random() < 0.5}, always),
+            (0.5, self._peer, always),
+            (2, lambda: {"do": "recover"}, always),
         ]
-        weighted = left_alone if is_long else everything
-        self._makers = [maker for _, maker in weighted]
-        self._weights = [weight for weight, _ in weighted]
+        """Weight of each maker of steps, and what the unit needs for it."""
+        left_alone: list[tuple[float, Callable[[], Step], object]] = [
+            (22, self._long_wait, always),
+            (10, self._read_any, self._telemetry),
+            (20, self._read_attitude, self._attitude_rows),
+            (20, self._read_count, self._count_rows),
+            (12, self._mode, self._mode_rows),
+            (3, self._flood, self._flood_rows),
+            (5, self._truth, always),
+            (6, self._clock, self._clock_rows),
+        ]
+        possible = [
+            (weight, maker) for weight, maker, needed in (left_alone if is_long else everything) if needed
+        ]
+        self._makers = [maker for _, maker in possible]
+        self._weights = [weight for weight, _ in possible]
 
     def steps(self) -> Iterator[Step]:
         """Generate steps without end; the effect of a telecommand is often read back, as an OBC does."""
@@ -263,26 +273,16 @@ class LifeGenerator:
         return {**step, "data": data.hex()} if data else step
 
     def _read_any(self) -> Step:
-        if not self._telemetry:
-            return self._wait()
         return self._request(self._random.choice(self._telemetry))
 
     def _read_attitude(self) -> Step:
-        return (
-            self._request(self._random.choice(self._attitude_rows))
-            if self._attitude_rows
-            else self._read_any()
-        )
+        return self._request(self._random.choice(self._attitude_rows))
 
     def _command(self) -> Step:
-        if not self._telecommands:
-            return self._read_any()
         (row,) = self._random.choices(self._telecommands, self._command_weights)
         return self._request(row, row.encode(self._values(row)))
 
     def _mode(self) -> Step:
-        if not self._mode_rows:
-            return self._read_any()
         row = self._random.choice(self._mode_rows)
         values = self._values(row)
         for field in row.named.values():
@@ -293,18 +293,14 @@ class LifeGenerator:
         return self._request(row, row.encode(values))
 
     def _read_count(self) -> Step:
-        return self._request(self._random.choice(self._count_rows)) if self._count_rows else self._read_any()
+        return self._request(self._random.choice(self._count_rows))
 
     def _clock(self) -> Step:
-        if not self._clock_rows:
-            return self._read_count()
         row = self._random.choice(self._clock_rows)
         return self._request(row, row.encode(self._values(row)))
 
     def _stream(self) -> Step:
         """Let the unit send telemetry without requests."""
-        if not self._stream_rows:
-            return self._read_any()
         row = self._random.choice(self._stream_rows)
         values: dict[str, Value] = {}
         for name, field in row.named.items():
@@ -319,11 +315,7 @@ class LifeGenerator:
     def _flood(self) -> Step:
         """Repeat the shortest request of its kind, often enough in a life if the unit has counters of 16 bits."""
         link = self._random.choice([link for link in self._links if link != "canopen"] or self._links[:1])
-        harmless = [row for row in self._telecommands if row.action == "nothing"]
-        rows = [min(kind, key=lambda row: row.size) for kind in (self._telemetry, harmless) if kind]
-        if not rows:
-            return self._wait()
-        row = self._random.choice(rows)
+        row = self._random.choice(self._flood_rows)
         narrow = any(
             (field.value or "").startswith("counters.") and field.raw_limits[1] <= 0xFFFF
             for other in self._count_rows
@@ -334,19 +326,13 @@ class LifeGenerator:
         return {**self._request(row, data), "do": "flood", "link": link, "count": count}
 
     def _cut(self) -> Step:
-        if not (rows := [*self._telecommands, *self._telemetry]):
-            return self._wait()
-        row = self._random.choice(rows)
+        row = self._random.choice(self._rows)
         return {**self._request(row), "do": "cut", "share": round(self._random.uniform(0.1, 0.9), 2)}
 
     def _nmt(self) -> Step:
-        if "canopen" not in self._links:
-            return self._read_any()
         return {"do": "nmt", "link": "canopen", "command": self._random.choice(NMT_COMMANDS)}
 
     def _burst(self) -> Step:
-        if not self._telemetry:
-            return self._wait()
         rows = [self._random.choice(self._telemetry) for _ in range(self._random.randint(2, 6))]
         link = self._random.choice([link for link in self._links if link != "canopen"] or self._links[:1])
         return {"do": "burst", "link": link, "rows": [[row.message_class, row.id, row.kind] for row in rows]}
@@ -402,14 +388,14 @@ class LifeGenerator:
     # --- invalid input ---
 
     def _invalid(self) -> Step:
-        if not (rows := [*self._telecommands, *self._telemetry]):
-            return self._wait()
-        row = self._random.choice(rows)
+        row = self._random.choice(self._rows)
         match self._random.randrange(3):
             case 0:
                 on_wire = any(item.code is not None for item in self._definition.classes)
                 known = {
-                    other.id for other in rows if not on_wire or other.message_class == row.message_class
+                    other.id
+                    for other in self._rows
+                    if not on_wire or other.message_class == row.message_class
                 }
                 unknown = [number for number in range(256) if number not in known]
                 number = self._random.choice(unknown) if unknown else row.id
