@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from starhil.hil_tests.errors import BenchError
+from starhil.protocol.units_of_measure import factor
 
 if TYPE_CHECKING:
     from starhil.protocol.icd.codec import Field, Row
@@ -149,8 +150,6 @@ def attitude_in(row: Row, values: Mapping[str, Value]) -> Quaternion:
         if field.value == "attitude.valid"
     ):
         raise BenchError(f"the attitude is not valid (reason {values.get('reason', '?')!s})")
-    from starhil.protocol.icd.units_of_measure import factor  # loads the definition, which no truth needs
-
     fields, rotation = named_fields
     return rotation([float(values[field.name]) * (factor(field.unit, "rad") or 1.0) for field in fields])
 

@@ -48,17 +48,26 @@ def _seconds(text: str) -> float:
     return seconds
 
 
+def _link(text: str) -> str:
+    """Return the value of an option of a link."""
+    if not text:
+        raise argparse.ArgumentTypeError("must not be empty; omit the option for an emulator")
+    return text
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add options that name a unit or the profile of the emulator."""
     group = parser.getgroup("starhil", "star tracker under test")
     group.addoption(
         "--starhil-serial",
         metavar="DEV",
+        type=_link,
         help="serial port of a unit, instead of an emulator (auto); off: none",
     )
     group.addoption(
         "--starhil-can",
         metavar="CHANNEL",
+        type=_link,
         help="CAN channel of a unit, instead of an emulator (auto); off: none",
     )
     group.addoption(

@@ -25,6 +25,7 @@ from typing import TypeVar
 _IMPORT = re.compile(
     r"^ *(?:from|import) (?P<module>starhil[\w.]*)(?: import (?P<names>\([^)]*\)|.*))?", re.MULTILINE
 )
+_CACHED = type(functools.cache(len))
 _CONSTANTS = (bool, int, float, str, bytes, tuple, frozenset, dict)
 
 
@@ -246,7 +247,7 @@ def _forget(changed: set[str]) -> None:
         changed = {name for name, module in modules.items() if not reached.isdisjoint(_imports(module))}
     values = [value for name in reached for value in vars(modules[name]).values()]
     for item in {id(value): value for value in values}.values():
-        if isinstance(item, functools._lru_cache_wrapper):
+        if isinstance(item, _CACHED):
             item.cache_clear()
 
 

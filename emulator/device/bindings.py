@@ -14,12 +14,12 @@ from starhil.emulator.device.snapshot import Snapshot
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Field, Row
 from starhil.protocol.icd.device_model import HEALTH, HEALTH_DEFAULTS, PARAMETER
-from starhil.protocol.icd.units_of_measure import factor
 from starhil.protocol.icd.values import Value
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from starhil.protocol.serial.checks import crc
 from starhil.protocol.unit.bindings import quantity_of
 from starhil.protocol.unit.layout import text_of
+from starhil.protocol.units_of_measure import factor
 
 
 class TelemetryBinding:

@@ -37,8 +37,8 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Field
 from starhil.protocol.icd.conventions import NANOSECONDS
-from starhil.protocol.icd.units_of_measure import factor
 from starhil.protocol.icd.values import Value
+from starhil.protocol.units_of_measure import factor
 
 log = logging.getLogger("starhil.device")
 

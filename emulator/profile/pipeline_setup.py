@@ -7,7 +7,7 @@ from typing import TypeAlias
 from starhil.emulator.profile.profile import Profile
 from starhil.emulator.sensor.pipeline.client import WorkerClient
 from starhil.emulator.sensor.pipeline.error_model import ErrorModel
-from starhil.emulator.sensor.pipeline.messages import PipelineSetup, SolverSettings
+from starhil.emulator.sensor.pipeline.messages import PipelineSetup, SolverSettings, SolvingOptions
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess, WorkerThread
 from starhil.protocol.icd.device_model import device_model
 
@@ -44,7 +44,13 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
         seed=profile.run.seed,
         build_in_background=profile.run.clock != "stepped" and not repeatable,
         previews=previews,
-        device=profile.device.model_dump(),
+        device=SolvingOptions(
+            dark_frames=profile.device.dark_frames,
+            tracking_stars=profile.device.tracking_stars,
+            tracking_windows=profile.device.tracking_windows,
+            largest_error_deg=profile.device.largest_error_deg,
+            wrong_predictions=profile.device.wrong_predictions,
+        ),
         calibration=profile.calibration.matrix(),
         exposure_s=float(profile.parameters.get("exposure", 200)) / 1000.0,
         images=profile.images.resolved(profile.folder),

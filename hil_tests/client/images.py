@@ -14,6 +14,7 @@ from starhil.hil_tests.client.async_client import AsyncObcClient
 from starhil.hil_tests.client.transactions import Reading
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.values import Value
 from starhil.protocol.image_transfer import (
     FRAME_SIZE,
@@ -58,6 +59,21 @@ class Image:
     """Frames or bursts that were requested again."""
     seconds: float
     """Duration of the download, without the capture."""
+
+
+def check_download(icd: InterfaceDefinition, size: str) -> None:
+    """Check that a unit has images as CubeStar has them, in a size.
+
+    Raises ProtocolError: it has none, or the size is unknown; the text gives the sizes.
+    """
+    if "save_image" not in icd.telecommands:
+        raise ProtocolError(
+            f"unit {icd.name} has no telecommand save_image: only images of CubeStar's kind can be downloaded"
+        )
+    try:
+        icd.enums["image_size"].number(size)
+    except ProtocolError as error:
+        raise ProtocolError(f"size: {error}") from None
 
 
 async def download_image(

@@ -25,7 +25,7 @@ from starhil.hil_tests.endurance.violation import Known, Violation
 from starhil.hil_tests.judge.messages import Value
 from starhil.hil_tests.judge.rows import Field
 from starhil.protocol.icd.conventions import Conventions
-from starhil.protocol.icd.units_of_measure import factor
+from starhil.protocol.units_of_measure import factor
 
 SIGMAS: Final = 6.0
 """A valid attitude is within this many of its stated standard deviations of the truth."""

@@ -19,7 +19,7 @@ from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.links import LINKS
 from starhil.hil_tests.judge.messages import Request, Value
 from starhil.hil_tests.judge.rows import PARAMETER, Field, Row
-from starhil.protocol.icd.units_of_measure import factor
+from starhil.protocol.units_of_measure import factor
 
 BOOT_S: Final = 0.6
 """Longest boot of the profile of a run."""

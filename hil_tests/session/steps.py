@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
-from starhil.hil_tests.client.images import write_png
+from starhil.hil_tests.client.images import check_download, write_png
 from starhil.hil_tests.client.raw_traffic import matches, send_and_listen
 from starhil.hil_tests.session.expect import ReadOperand, Variable, resolve, show, unknown_fields
 from starhil.hil_tests.session.step import MS_PER_S, Attempt, RequestStep, SessionState, Step
@@ -258,14 +258,10 @@ class DownloadImage(Step):
 
     def _problems(self, info: ValidationInfo) -> Iterator[str]:
         yield from super()._problems(info)
-        icd = (info.context or {})["icd"]
-        if "save_image" not in icd.telecommands:
-            yield f"unit {icd.name} has no telecommand save_image: only images of CubeStar's kind can be downloaded"
-            return
         try:
-            icd.enums["image_size"].number(self.size)
+            check_download((info.context or {})["icd"], self.size)
         except ProtocolError as error:
-            yield f"size: {error}"
+            yield str(error)
 
     def run(self, session: SessionState, link: str) -> Attempt:
         """Download the image; a blank one is a problem."""

@@ -8,7 +8,7 @@ from starhil.protocol.errors import IcdError, did_you_mean
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Field, Row
 from starhil.protocol.icd.device_model import ActionModel, ArgumentModel, DeviceModel, QuantityModel, generic
-from starhil.protocol.icd.units_of_measure import convertible, factor
+from starhil.protocol.units_of_measure import convertible, factor
 
 ANY_UNIT = "*"
 SET_PARAMETERS = "set_parameters"

@@ -21,7 +21,12 @@ from starid.storage.files import MEGABYTE, is_stream, read_bytes, write_atomical
 IMAGE_LIMIT: Final = 1000 * MEGABYTE
 """Largest image file that is read, bytes: a 16-bit colour TIFF of the largest cameras has about 900 MB."""
 
+PIXEL_LIMIT: Final = 200_000_000
+"""Largest image that is processed, pixels: those of the largest cameras have 150 million; each takes some 30 bytes of memory."""
+
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
+_PNG_SIZE: Final = (16, 20)
+"""Where width and height of a PNG begin, of 4 bytes each."""
 _JPEG: Final = b"\xff\xd8\xff"
 _TIFFS: Final = (b"II*\x00", b"MM\x00*")
 _BMP: Final = b"BM"
@@ -64,7 +69,10 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> GreyImage:
             f"image {source}: cannot be read ({error.strerror}); give a readable file"
         ) from None
     _check_whole(source, content)
+    if content.startswith(_PNG):
+        _check_size(source, *(int.from_bytes(content[at : at + 4], "big") for at in _PNG_SIZE))
     pixels = _decode(source, content)
+    _check_size(source, *pixels.shape[1::-1])
     if pixels.ndim == 3:
         if not allow_colour:
             raise StaridError(
@@ -158,6 +166,14 @@ def _check_whole(source: Path, content: bytes) -> None:
         raise _truncated(source)
 
 
+def _check_size(source: Path, width: int, height: int) -> None:
+    """Reject an image that would take the memory of the machine."""
+    if width * height > PIXEL_LIMIT:
+        raise StaridError(
+            f"image {source}: {width} × {height} pixels are more than {PIXEL_LIMIT // 1_000_000} million; crop it, or reduce its size"
+        )
+
+
 def _truncated(source: Path) -> StaridError:
     return StaridError(f"image {source}: truncated or damaged; write or download the file again")
 
@@ -210,7 +226,10 @@ def _decode(source: Path, content: bytes) -> NDArray[Any]:
         with _without_stderr() if content.startswith(_PNG) else contextlib.nullcontext():
             pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
-        raise StaridError(f"image {source}: cannot be decoded ({error.err}); convert it to PNG") from None
+        remedy = (
+            "crop it, or reduce its size" if "MAX_IMAGE_PIXELS" in str(error.err) else "convert it to PNG"
+        )
+        raise StaridError(f"image {source}: cannot be decoded ({error.err}); {remedy}") from None
     finally:
         log.setLogLevel(level)
     if pixels is None or pixels.size == 0:

@@ -131,6 +131,10 @@ def test_the_traceback_of_an_error_ends_at_the_test_and_a_fixture_has_none(tmp_p
         ("--starhil-unit=cubstar", "ERROR: --starhil-unit: unit 'cubstar': not found; "),
         ("--starhil-profile=idel", "ERROR: --starhil-profile: profile 'idel': not found; "),
         ("--starhil-dialect=z", "argument --starhil-dialect: invalid choice: 'z'"),
+        (
+            "--starhil-serial=",
+            "argument --starhil-serial: must not be empty; omit the option for an emulator",
+        ),
         ("--starhil-timeout=-1", "argument --starhil-timeout: must be 0.01 to 1e+06 s, not -1"),
         ("--starhil-timeout=nan", "argument --starhil-timeout: must be 0.01 to 1e+06 s, not nan"),
     ],

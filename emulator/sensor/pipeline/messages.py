@@ -85,6 +85,17 @@ class SolverSettings:
 
 
 @dataclass(frozen=True)
+class SolvingOptions:
+    """Keys of `[device]` in a profile that concern the pipeline."""
+
+    dark_frames: int
+    tracking_stars: int
+    tracking_windows: bool
+    largest_error_deg: float
+    wrong_predictions: float
+
+
+@dataclass(frozen=True)
 class PipelineSetup:
     """Configuration of the pipeline, fixed for a run."""
 
@@ -93,8 +104,7 @@ class PipelineSetup:
     sky: dict[str, Any]
     identifier: dict[str, Any]
     """Fields of the camera, the sensor model and the sky objects, and options of the algorithm, by name."""
-    device: dict[str, Any]
-    """Keys of `[device]` in a profile."""
+    device: SolvingOptions
     catalog_path: str
     epoch: float
     """Catalogue file (empty: the installed one) and the Julian year of the star positions."""

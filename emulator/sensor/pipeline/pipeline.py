@@ -337,7 +337,7 @@ class Pipeline:
 
     def _without_dark(self, image: NDArray[Any], request: FrameRequest) -> NDArray[Any]:
         """Subtract the unit's dark frame, scaled to the exposure, gain and temperature of the image."""
-        frames = self._setup.device["dark_frames"]
+        frames = self._setup.device.dark_frames
         if frames == 0:
             return image
         if self._dark is None:
@@ -377,14 +377,10 @@ class Pipeline:
                 camera, self._calibration, xy[used], errors[used], offsets, PRIOR_FREEDOM
             )
             solution = flagged(
-                replace(solution, covariance=covariance, sigma_px=noise_px), self._largest_error_deg
+                replace(solution, covariance=covariance, sigma_px=noise_px),
+                self._setup.device.largest_error_deg,
             )
         return solution
-
-    @property
-    def _largest_error_deg(self) -> float:
-        """Largest error of an attitude, degrees."""
-        return float(self._setup.device["largest_error_deg"])
 
     def _solve_or_follow(
         self,
@@ -413,7 +409,7 @@ class Pipeline:
 
         Without agreement, the given ones are returned: an attitude that is less certain than the prediction is then invalid.
         """
-        covariance, least = request.prediction_covariance, self._setup.device["tracking_stars"]
+        covariance, least = request.prediction_covariance, self._setup.device.tracking_stars
         predicted = self._window_centre(request)
         if covariance is None or least == 0 or predicted is None or self._leaves_trails(request):
             return detections, failed
@@ -434,8 +430,8 @@ class Pipeline:
         in_windows, rivals, searched = detect_near(image, places, _window_px(settings), faint)
         solution = solve_with_prediction(
             camera, stars, in_windows, Prediction(predicted, covariance, request.prediction_freedom),
-            2.5 * log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY, self._largest_error_deg,
-            wrong_predictions=self._setup.device["wrong_predictions"], rivals=rivals, searched=searched,
+            2.5 * log10(sensor.zero_magnitude_e_s * sensor.exposure_s), _MAX_FALSE_PROBABILITY, self._setup.device.largest_error_deg,
+            wrong_predictions=self._setup.device.wrong_predictions, rivals=rivals, searched=searched,
             observer_velocity=request.observer_velocity, camera_covariance=self._calibration,
         )  # fmt: skip
         if not solution.valid or solution.star_count < least:
@@ -448,7 +444,7 @@ class Pipeline:
     ) -> Detections | None:
         """Detect the brightest predicted stars in windows; None if the unit does not, or if stars leave trails."""
         predicted = self._window_centre(request)
-        if not self._setup.device["tracking_windows"] or predicted is None or self._leaves_trails(request):
+        if not self._setup.device.tracking_windows or predicted is None or self._leaves_trails(request):
             return None
         settings = request.settings
         stars = self._tracked_stars(settings.limiting_magnitude)
@@ -488,7 +484,7 @@ class Pipeline:
         setup, settings = self._setup, request.settings
         options: dict[str, Any] = {**setup.identifier}
         options["limiting_magnitude"] = settings.limiting_magnitude
-        options["largest_error_deg"] = self._largest_error_deg
+        options["largest_error_deg"] = self._setup.device.largest_error_deg
         if setup.algorithm != "geometric":  # LSI and RSI count the stars above a magnitude
             options.setdefault("zero_point", 2.5 * log10(self._sensor.zero_magnitude_e_s))
             options.setdefault("colour_term", self._sensor.colour_term)

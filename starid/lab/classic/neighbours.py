@@ -124,15 +124,6 @@ def bright_neighbour(
 
 
 @compiled_ieee
-def neighbour_list(vectors: Array, pivot: int, radius: float) -> tuple[Array, Indices]:
-    """Chords and azimuths (m, 2) of a star's neighbours in order of distance, and their rows (m,)."""
-    polar = np.empty((vectors.shape[0], 2))
-    rows = np.empty(vectors.shape[0], dtype=np.int64)
-    count = neighbours_of(vectors, pivot, radius, polar, rows)
-    return polar[:count].copy(), rows[:count].copy()
-
-
-@compiled_ieee
 def neighbour_table(vectors: Array, radius: float) -> tuple[Indices32, Array32, NDArray[np.uint16]]:
     """List the neighbours of all stars.
 

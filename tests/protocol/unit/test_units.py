@@ -8,10 +8,10 @@ from starhil.protocol.errors import IcdError
 from starhil.protocol.files.bundled import SKELETON, bundled_units
 from starhil.protocol.icd import FieldError
 from starhil.protocol.icd.device_model import device_model
-from starhil.protocol.icd.units_of_measure import factor
 from starhil.protocol.plugin import quantity
 from starhil.protocol.unit import load_unit
 from starhil.protocol.unit.examples import examine, exchanges
+from starhil.protocol.units_of_measure import factor
 
 HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "d"\n'
 BIG = HEAD + '[conventions]\nbyte_order = "big"\n'

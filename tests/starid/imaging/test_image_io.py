@@ -157,6 +157,28 @@ def test_other_files_are_rejected(tmp_path: Path, content: bytes) -> None:
         read_image(tmp_path / "a.png")
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("large.png", "30000 × 30000 pixels are more than 200 million; crop it, or reduce its size"),
+        ("large.bmp", r"cannot be decoded \(.*MAX_IMAGE_PIXELS.*\); crop it, or reduce its size"),
+    ],
+)
+def test_images_that_would_take_the_memory_of_the_machine_are_rejected(
+    tmp_path: Path, name: str, message: str
+) -> None:
+    edge = 30_000 if name.endswith("png") else 40_000
+    head = b"IHDR" + struct.pack(">IIBBBBB", edge, edge, 8, 0, 0, 0, 0)
+    png = b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        for chunk in (head, b"IDAT" + zlib.compress(bytes(1000)), b"IEND")
+    )
+    bmp = struct.pack("<2sIIIIiiHHIIiiII", b"BM", 54, 0, 54, 40, edge, edge, 1, 24, 0, 0, 0, 0, 0, 0)
+    (tmp_path / name).write_bytes(png if name.endswith("png") else bmp)
+    with pytest.raises(StaridError, match=message):
+        read_image(tmp_path / name)
+
+
 def test_missing_files_and_folders_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(StaridError, match="no such file"):
         read_image(tmp_path / "nothing.png")
