@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -21,20 +20,6 @@ def example(name):
     """The block that begins with its file name."""
     (block,) = [each for each in blocks(PAGE) if each.text.startswith(f"# {name}\n")]
     return block.text
-
-
-@pytest.mark.process
-def test_the_session_passes(tmp_path):
-    (tmp_path / "fdir.toml").write_text(example("fdir.toml"))
-    command = Path(sys.executable).with_name("starhil")
-    done = subprocess.run(
-        [command, "session", "fdir.toml", "--start"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 @pytest.mark.process

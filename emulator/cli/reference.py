@@ -6,8 +6,8 @@ A page contains its own text and, between two comments with the name of a table,
     …
     <!-- end: profile -->
 
-`tools/make_reference.py` updates these. A table too long to be read as text is only a mark, `<!-- built: commands -->`, which `make docs`
-and `starhil docs` replace.
+`tools/make_reference.py` updates these. In place of a table too long to be read as text stands a line that ends in a mark,
+`<!-- built: commands -->`, which `make docs` and `starhil docs` replace.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ UNITS: Final = {
     "rate_window": "frames",
     "split": "bytes",
     "star_magnitude_noise": "mag",
-    "start_unix_s": "Unix time, s",
+    "start_unix_s": "s, Unix time",
     "width": "px",
 }
 """Units of keys whose names do not end in a unit."""
@@ -69,7 +69,7 @@ EXPONENT_FROM: Final = 1e6
 """Numbers from here on are shown with an exponent if no digits are lost."""
 
 Row = tuple[str, ...]
-HEAD: Final[Row] = ("key", "unit", "range", "default", "meaning")
+HEAD: Final[Row] = ("key", "range", "default", "meaning")
 
 
 # --- parts of a table ---
@@ -89,6 +89,11 @@ def table(rows: list[Row], head: Row = HEAD) -> str:
 def unit(key: str) -> str:
     """Return the unit of a key, empty if it has none."""
     return UNITS.get(key) or next((name for end, name in SUFFIXES.items() if key.endswith(end)), "")
+
+
+def in_unit(values: str, of: str) -> str:
+    """Return a range in a unit, each of which may be empty."""
+    return " ".join(filter(None, (values, of)))
 
 
 def literal(value: object) -> str:
@@ -198,7 +203,7 @@ def model_rows(model: type[BaseModel]) -> list[Row]:
     """Return a row for each plain key of a model."""
     texts, properties = attribute_docstrings(model), model.model_json_schema()["properties"]
     return [
-        (f"`{name}`", unit(name), limits(properties[name]), default(field), texts[name])
+        (f"`{name}`", in_unit(limits(properties[name]), unit(name)), default(field), texts[name])
         for name, field in model.model_fields.items()
     ]
 
@@ -331,7 +336,8 @@ def dataclass_rows(kind: Any, skipped: Container[str] = ()) -> list[Row]:
         allowed = "" if low is None or high is None or low <= -1e5 else f"{number(low)} to {number(high)}"
         value = "required" if field.default is dataclasses.MISSING else literal(field.default)
         name, of_field = field.name, of or unit(field.name)
-        rows.append((f"`{name}`", of_field, CHOICES.get(name, allowed), value, texts[name]))
+        allowed = in_unit(CHOICES.get(name, allowed), of_field)
+        rows.append((f"`{name}`", allowed, value, texts[name]))
     return rows
 
 
@@ -348,7 +354,7 @@ def identifier() -> str:
         names = sorted(
             {field.name for field in dataclasses.fields(algorithm.options)} - DEVICE_OPTIONS.keys()
         )
-        rows: list[Row] = [(f"`{option}`", "", "", "", texts[option]) for option in names]
+        rows: list[Row] = [(f"`{option}`", "", "", texts[option]) for option in names]
         parts.append(f'### With `run.algorithm = "{name}"`\n\n{table(rows)}')
     return "\n\n".join(parts)
 
@@ -364,8 +370,8 @@ def faults() -> str:
     enums = load_unit().enums
     rows: list[Row] = []
     for row, effect in zip(model_rows(DeviceFault), EFFECTS.values(), strict=True):
-        allowed = ", ".join(f"`{name}`" for name in enums[effect.enum].values) if effect.enum else row[2]
-        rows.append((row[0], row[1], allowed, row[3], row[4]))
+        allowed = ", ".join(f"`{name}`" for name in enums[effect.enum].values) if effect.enum else row[1]
+        rows.append((row[0], allowed, row[2], row[3]))
     return (
         f"### `device`\n\n{table(rows)}\n\n### `clock`\n\n{table(model_rows(ClockFault))}\n\n### `telemetry`\n\n"
         "A table, or a list of tables. [FDIR tests](fdir.md) has examples; on CANopen, PDOs and SDO answers are affected.\n\n"
@@ -418,7 +424,7 @@ def unit_definition() -> str:
         schema = model.model_json_schema()
         properties = schema.get("properties") or schema["$defs"][model.__name__]["properties"]
         rows: list[Row] = [
-            (f"`{key}`", "", limits(properties[key]), default(field, properties[key]), texts[name])
+            (f"`{key}`", limits(properties[key]), default(field, properties[key]), texts[name])
             for name, field in model.model_fields.items()
             for key in (field.alias or name,)
             if f'{key} = "' not in heading
@@ -621,7 +627,8 @@ TABLES: Final[dict[str, Callable[[], str]]] = {
 """Name of a table in a page → function that writes it."""
 
 BLOCK: Final = re.compile(r"(<!-- begin: (\w+).*?\n).*?(<!-- end: \2)", re.DOTALL)
-BUILT: Final = re.compile(r"<!-- built: (\w+) -->")
+BUILT: Final = re.compile(r"^.*<!-- built: (\w+) -->$", re.MULTILINE)
+"""A line that stands for a table, and says where to read it."""
 
 
 def with_tables(page: str) -> str:

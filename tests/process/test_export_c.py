@@ -85,6 +85,7 @@ def test_the_component_of_the_docs_reads_the_attitude(emulator, tmp_path: Path) 
         pytest.skip("no C compiler (cc, gcc or clang) here: the example of docs/c-export.md is not compiled")
     page = (Path(__file__).parents[2] / "docs" / "c-export.md").read_text(encoding="utf-8")
     files = dict(re.findall(r"^```c\n/\* (\S+) \*/\n(.*?)^```$", page, re.MULTILINE | re.DOTALL))
+    files["main.c"] = Path(__file__).with_name("star_sensor_main.c").read_text(encoding="utf-8")
     for name, text in {**files, **export_folder(ICD, "c")}.items():
         (tmp_path / name).write_text(text)
     program = tmp_path / "example"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import re
 import signal
 import socket
@@ -27,7 +26,6 @@ FILES = {
     match[2]: match[1]
     for match in re.finditer(r"^```(?:python|toml)\n(# (\S+)\n.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
 }
-PNG = b"\x89PNG\r\n\x1a\n"
 
 needs_basilisk = pytest.mark.skipif(
     importlib.util.find_spec("Basilisk") is None,
@@ -49,7 +47,7 @@ def start(folder: Path, *command: str) -> subprocess.Popen[str]:
     # SIGINT as in a terminal, even if the tests run with it ignored
     return subprocess.Popen(
         [sys.executable, *command], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**os.environ, "MPLBACKEND": "Agg"}, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
 
 
@@ -80,11 +78,10 @@ def test_basilisk_in_lock_step(tmp_path):
     command = emulator_command(profile=str(tmp_path / "basilisk.toml"))
     with EmulatorProcess(command) as emulator:
         write_files(tmp_path, "orbit.py", port=port, serial=emulator.ready["serial"])
-        figures = printed(start(tmp_path, "orbit.py", "tumble", "120"))
+        figures = printed(start(tmp_path, "orbit.py", "120"))
     assert figures["attitudes read"][0] > 116
     assert figures["largest error of the rate"][0] < 0.01
     assert figures["within"][1] >= 99.7
-    assert (tmp_path / "tumble.png").read_bytes().startswith(PNG)
 
 
 @needs_basilisk
@@ -100,7 +97,7 @@ def test_basilisk_in_real_time(tmp_path):
     with EmulatorProcess(command) as emulator:
         write_files(tmp_path, "orbit.py", "obc.py", port=port, serial=emulator.ready["serial"])
         obc = start(tmp_path, "obc.py")
-        assert printed(start(tmp_path, "orbit.py", "pointing", "6", "--real-time")) == {}
+        assert printed(start(tmp_path, "orbit.py", "6", "--real-time")) == {}
         obc.send_signal(signal.SIGINT)
         figures = printed(obc)
     assert figures["attitudes read"][0] >= 3
