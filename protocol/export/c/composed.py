@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
+from itertools import groupby
+from operator import attrgetter
 from typing import Any, Final
 
 from starhil.protocol.errors import IcdError
@@ -136,8 +139,14 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
             return "request_length(header_size(id), size)"
         return role(field.role, field.initial, (1 << 8 * field.size) - 1)
 
-    def class_test(field: HeaderFieldModel, code: str) -> str:
-        return " || ".join(f"({code}) == {classes[name].code or 0}u" for name in sorted(field.classes or ()))
+    def class_test(names: list[str], code: str) -> str:
+        return " || ".join(f"({code}) == {classes[name].code or 0}u" for name in sorted(names))
+
+    def by_classes(
+        fields: Iterable[HeaderFieldModel],
+    ) -> list[tuple[list[str] | None, list[HeaderFieldModel]]]:
+        """Return the fields in groups of neighbours that the same classes have, None if all have them."""
+        return [(names, list(group)) for names, group in groupby(fields, key=attrgetter("classes"))]
 
     replies = []
     for item in classes.values():
@@ -148,6 +157,7 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
     return {
         "number": _number,
         "packed": packed,
+        "by_classes": by_classes,
         "class_test": class_test,
         "suffix": lambda field: _suffix(field.order or stack.byte_order),
         "requests": stack.requests.header,

@@ -49,3 +49,10 @@ def test_the_stack_of_the_exported_c_is_known_and_small(unit, tmp_path):
     assert {kind for _, _, kind in FUNCTION.findall(graph)} == {"static"}
     (stated,) = STATED.findall(PAGE.read_text(encoding="utf-8"))
     assert deepest_call(graph) <= int(stated)
+
+
+def test_fields_that_the_same_classes_have_are_read_in_one_condition():
+    """cppcheck reports a condition that is the same as the previous one."""
+    icd = load_unit("sagitta")
+    source = files(icd, SerialStack(icd))["sagitta.c"]
+    assert source.count("if ((klass) == 2u) {") == 1
