@@ -12,6 +12,7 @@ import numpy.typing as npt
 from starhil.emulator.sensor.model import SensorModel
 from starid.arithmetic.arrays import Array32, Indices, elementwise
 from starid.arithmetic.elementary import exp, power, square
+from starid.camera import Camera
 
 _HOT_LOG_SPREAD: Final = 1.0
 
@@ -77,8 +78,10 @@ class FixedPattern:
     """Rows and columns of the hot and of the dead pixels, (n, 2), int."""
 
 
-def make_fixed_pattern(sensor: SensorModel, height: int, width: int) -> FixedPattern:
-    """Draw the fixed pattern of a pixel array from the sensor's `pattern_seed`.
+def make_fixed_pattern(
+    sensor: SensorModel, height: int, width: int, lens: Camera | None = None
+) -> FixedPattern:
+    """Draw the fixed pattern of a pixel array from the sensor's `pattern_seed`; behind a lens its sensitivity falls by the vignetting.
 
     Dark currents are gamma-distributed (never negative, with the long upper tail of silicon), sensitivities
     are normal, hot pixels log-normal. No pixel is both hot and dead. Radiation damage adds dark current and random
@@ -94,6 +97,7 @@ def make_fixed_pattern(sensor: SensorModel, height: int, width: int) -> FixedPat
         pixels,
         spreads,
         square(sensor.pixel_um) * sensor.epi_um * sensor.damage_tev_g,
+        None if lens is None or sensor.vignetting == 0 else (lens, sensor.vignetting),
     )
 
 
@@ -105,6 +109,7 @@ def _draw(
     pixels: tuple[int, int],
     spreads: tuple[float, float, float, float],
     damage: float,
+    vignetting: tuple[Camera, int] | None,
 ) -> FixedPattern:
     """Draw a read-only pattern from numbers of (hot, dead) pixels, (prnu, dsnu, dark_e_s, hot_e_s) and damage, µm³·TeV/g."""
     hot_pixels, dead_pixels = pixels
@@ -137,6 +142,8 @@ def _draw(
     )
     sensitivity[dead] = 0.0
     dark[dead] = 0.0
+    if vignetting is not None:
+        sensitivity *= _falloff(*vignetting)
     for pattern in (sensitivity, dark):
         pattern.flags.writeable = False
     return FixedPattern(
@@ -146,3 +153,11 @@ def _draw(
         np.column_stack(np.divmod(np.sort(hot), width)),
         np.column_stack(np.divmod(np.sort(dead), width)),
     )
+
+
+def _falloff(camera: Camera, power: int) -> Array32:
+    """Power of the cosine of the angle of each pixel from the optical axis, row by row, (h·w,)."""
+    rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
+    directions = camera.back_project(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
+    cosine = np.maximum(directions[:, 2], 0.0)
+    return np.asarray(np.prod([cosine] * power, axis=0), dtype=np.float32)

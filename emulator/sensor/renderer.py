@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.sensor.fixed_pattern import FixedPattern, make_fixed_pattern
+from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.noise import digitize
 from starhil.emulator.sensor.overexposure import Afterimage, spill
@@ -152,8 +151,7 @@ class Renderer:
         self._painter = AreaPainter(camera, self.sensor.zero_magnitude_e_s, self.sensor.psf_sigma_px)
         self._stars = SkyStars(catalog, self.sensor, camera.pixel_scale_rad, seed)
         self._cos_cone = cos(min(camera.field_radius_rad + _CONE_MARGIN_RAD, math.pi))
-        pattern = make_fixed_pattern(self.sensor, camera.height, camera.width)
-        self._pattern = _vignetted(pattern, camera, self.sensor.vignetting)
+        self._pattern = make_fixed_pattern(self.sensor, camera.height, camera.width, camera)
         self._sky_e_s = np.float32(self.sensor.sky_e_s(camera.pixel_scale_rad))
         self._still = np.empty((camera.height, camera.width), dtype=np.float32)
         self._still_conditions = (math.nan, math.nan)
@@ -400,22 +398,6 @@ class Renderer:
         longest = 2.0 * float(np.max(lengths(path[:, 2:4]), initial=0.0))
         nodes, weights = path_rule(longest, base)
         add_spots(mean, self._pattern.sensitivity, path, electrons, sigma, nodes, weights)
-
-
-def _vignetted(pattern: FixedPattern, camera: Camera, power: int) -> FixedPattern:
-    """Return a pattern whose sensitivity falls with a power of the cosine of the angle from the optical axis."""
-    return (
-        pattern if power == 0 else replace(pattern, sensitivity=pattern.sensitivity * _falloff(camera, power))
-    )
-
-
-@lru_cache(maxsize=2)
-def _falloff(camera: Camera, power: int) -> Array32:
-    """Power (h, w) of the cosine of the angle of each pixel from the optical axis."""
-    rows, columns = np.mgrid[0 : camera.height, 0 : camera.width]
-    directions = camera.back_project(np.column_stack([columns.ravel(), rows.ravel()]).astype(np.float64))
-    cosine = np.maximum(directions[:, 2], 0.0).reshape(camera.height, camera.width)
-    return np.asarray(np.prod([cosine] * power, axis=0), dtype=np.float32)
 
 
 def render(

@@ -52,6 +52,17 @@ def test_the_pipeline_starts_without_the_libraries_of_the_links() -> None:
     )
 
 
+def test_kernels_run_without_the_linear_algebra_for_which_numba_looks() -> None:
+    text = """import sys
+from starhil.emulator.sensor.pipeline.worker import call_first_kernel
+call_first_kernel()
+from starid.identification.geometric.identifier import Identifier
+Identifier().warm_up()
+assert "scipy.linalg" not in sys.modules
+import scipy.linalg"""
+    subprocess.run([sys.executable, "-c", text], check=True)
+
+
 def test_the_process_of_an_fmu_starts_without_the_definition() -> None:
     text = "import sys, starhil.emulator.cli.fmu.process; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
