@@ -10,9 +10,9 @@ from tests.planted import PlantedDefect, read_defects
 
 @dataclass(frozen=True)
 class Mutant(PlantedDefect):
-    """An error, and the area of the cases that ought to find it."""
+    """An error, and the case that finds it, of those named `canopen.…`."""
 
-    area: str
+    case: str
 
 
 MUTANTS = read_defects(Path(__file__).with_name("mutants.toml"), Mutant)

@@ -24,16 +24,35 @@ KNOWN = DetectionSettings(gain_e_per_dn=GAIN)
 
 def spot(shape: tuple[int, int], x: float, y: float, flux: float, sigma: float = SIGMA) -> np.ndarray:
     """A Gaussian star integrated over pixels, independent of the code under test."""
-    profiles = [
-        np.diff(0.5 * erf((np.arange(size + 1) - 0.5 - place) / (sigma * math.sqrt(2.0))))
-        for size, place in zip(shape, (y, x), strict=True)
-    ]
-    return flux * np.outer(*profiles)
+    return spots(shape, np.array([[x, y]]), flux, sigma)
 
 
-def trail(shape: tuple[int, int], x: float, y: float, flux: float, dx: float, dy: float) -> np.ndarray:
+def spots(
+    shape: tuple[int, int],
+    places: np.ndarray,
+    flux: float | np.ndarray,
+    sigma: float | np.ndarray = SIGMA,
+) -> np.ndarray:
+    """The light of many such stars: the product of their profiles along columns and rows, summed by a product of matrices."""
+    width = np.reshape(sigma, (-1, 1)) * math.sqrt(2.0)
+    down, along = (
+        np.diff(0.5 * erf((np.arange(size + 1) - 0.5 - place[:, None]) / width))
+        for size, place in zip(shape, (places[:, 1], places[:, 0]), strict=True)
+    )
+    return (down.T * flux) @ along
+
+
+def trails(
+    shape: tuple[int, int],
+    places: np.ndarray,
+    flux: float | np.ndarray,
+    paths: np.ndarray,
+    sigma: float = SIGMA,
+) -> np.ndarray:
+    """Stars that move evenly along a path, its middle at their places."""
     parts = (np.arange(64) + 0.5) / 64 - 0.5
-    return sum(spot(shape, x + part * dx, y + part * dy, flux / 64) for part in parts)
+    moved = places[:, None] + parts[:, None] * np.reshape(paths, (-1, 1, 2))
+    return spots(shape, moved.reshape(-1, 2), np.repeat(np.broadcast_to(flux, len(places)) / 64, 64), sigma)
 
 
 def photograph(
@@ -69,9 +88,7 @@ def test_stars_are_found_where_they_are(top: int) -> None:
     shape = (300, 400)
     places = scattered(40, shape, 2)
     fluxes = np.geomspace(200.0, 900.0, 40)
-    image = photograph(
-        sum(spot(shape, *place, flux) for place, flux in zip(places, fluxes, strict=True)), top=top
-    )
+    image = photograph(spots(shape, places, fluxes), top=top)
     detections = detect(image, KNOWN)
     number, spurious = matched(detections, places)
     assert np.all(number >= 0)
@@ -93,7 +110,7 @@ def test_errors_are_calibrated_and_reach_the_bound(flux: float) -> None:
     squares, stated = [], []
     for seed in range(4):
         places = scattered(120, shape, seed, gap=16.0)
-        image = photograph(sum(spot(shape, *place, flux) for place in places), seed)
+        image = photograph(spots(shape, places, flux), seed)
         detections = detect(image, DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA, model_error=0.0))
         number, _ = matched(detections, places)
         assert np.all(number >= 0)
@@ -114,7 +131,7 @@ def test_no_pixel_phase_error() -> None:
     places = np.array(
         [(20.0 * i + i / 20.0, 20.0 * j + j / 20.0) for i in range(1, 20) for j in range(1, 20)]
     )
-    light = sum(spot(shape, *place, 30000.0) for place in places)
+    light = spots(shape, places, 30000.0)
     found = detect(photograph(light), KNOWN)
     number, _ = matched(found, places)
     error = found.xy_px[number] - places
@@ -134,7 +151,7 @@ def test_noise_is_not_detected_as_stars() -> None:
 def test_saturated_stars_are_flagged_and_still_centred() -> None:
     shape = (200, 200)
     places = scattered(15, shape, 4, gap=30.0)
-    light = sum(spot(shape, *place, 20000.0) for place in places)
+    light = spots(shape, places, 20000.0)
     image = photograph(light, top=255)
     detections = detect(image, DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA))
     number, spurious = matched(detections, places, 0.5)
@@ -149,7 +166,7 @@ def test_saturated_stars_are_flagged_and_still_centred() -> None:
 def test_stars_at_the_edge_are_flagged() -> None:
     shape = (120, 160)
     places = np.array([(0.4, 60.0), (159.2, 30.0), (80.0, 0.2), (40.0, 118.7), (80.0, 60.0), (30.0, 40.0)])
-    detections = detect(photograph(sum(spot(shape, *place, 2000.0) for place in places)), KNOWN)
+    detections = detect(photograph(spots(shape, places, 2000.0)), KNOWN)
     number, _ = matched(detections, places)
     assert np.all(number >= 0)
     assert detections.edge[number].tolist() == [True, True, True, True, False, False]
@@ -162,7 +179,7 @@ def test_stars_at_the_edge_are_flagged() -> None:
 def test_hot_pixels_are_rejected(height: float) -> None:
     shape = (300, 300)
     places = scattered(30, shape, 6)
-    light = sum(spot(shape, *place, 1500.0) for place in places[:15])
+    light = spots(shape, places[:15], 1500.0)
     light[tuple(np.rint(places[15:]).astype(int)[:, ::-1].T)] += height
     detections = detect(photograph(light), KNOWN)
     number, spurious = matched(detections, places[:15])
@@ -187,7 +204,7 @@ def test_pairs_are_deblended(separation: float) -> None:
     partners = places + separation * np.column_stack([np.cos(angles), np.sin(angles)])
     both = np.concatenate([places, partners])
     fluxes = np.concatenate([np.full(40, 4000.0), np.full(40, 2500.0)])
-    light = sum(spot(shape, *place, flux) for place, flux in zip(both, fluxes, strict=True))
+    light = spots(shape, both, fluxes)
     found = detect(photograph(light), DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA))
     gaps = np.linalg.norm(both[:, None] - found.xy_px[None], axis=2)
     assert np.mean(gaps.min(axis=1) < 0.3) > 0.95
@@ -244,7 +261,7 @@ def test_trails_of_a_rotating_sensor_are_followed(dx: float, dy: float) -> None:
     places = scattered(40, shape, 9, gap=45.0)
     places = places[np.all((places > 20.0) & (places < np.array([479.0, 379.0])), axis=1)]
     fluxes = np.geomspace(3000.0, 30000.0, len(places))
-    light = sum(trail(shape, *place, flux, dx, dy) for place, flux in zip(places, fluxes, strict=True))
+    light = trails(shape, places, fluxes, np.array([dx, dy]))
     detections = detect(photograph(light), KNOWN)
     number, spurious = matched(detections, places)
     assert np.all(number >= 0)
@@ -260,8 +277,8 @@ def test_trails_are_followed_among_more_and_brighter_round_points() -> None:
     places = scattered(60, shape, 9, gap=30.0)
     places = places[np.all((places > 20.0) & (places < np.array([479.0, 379.0])), axis=1)]
     stars, points = places[::3], np.concatenate([places[1::3], places[2::3]])
-    light = sum(trail(shape, *place, 3000.0, 6.0, -2.0) for place in stars)
-    light = light + sum(spot(shape, *place, 9000.0) for place in points)
+    light = trails(shape, stars, 3000.0, np.array([6.0, -2.0]))
+    light = light + spots(shape, points, 9000.0)
     detections = detect(photograph(light), KNOWN)
     assert len(points) > 1.8 * len(stars) > 18
     assert detections.trail_px == pytest.approx(math.hypot(6.0, 2.0), rel=0.1)
@@ -275,10 +292,10 @@ def test_trails_are_followed_among_more_and_brighter_round_points() -> None:
 def test_a_few_streaks_among_round_stars_are_not_trails() -> None:
     shape = (400, 500)
     places = scattered(60, shape, 9, gap=30.0)
-    light = sum(spot(shape, *place, 3000.0) for place in places[:40])
+    light = spots(shape, places[:40], 3000.0)
     angles = np.linspace(0.0, math.pi, 12, endpoint=False)
-    for place, angle in zip(places[40:52], angles, strict=True):
-        light = light + trail(shape, *place, 9000.0, 12.0 * math.cos(angle), 12.0 * math.sin(angle))
+    paths = 12.0 * np.column_stack([np.cos(angles), np.sin(angles)])
+    light = light + trails(shape, places[40:52], 9000.0, paths)
     found = detect(photograph(light), KNOWN)
     assert found.trail_px == 0.0
     number, _ = matched(found, places[:40])
@@ -290,13 +307,8 @@ def few_trails(seed: int, width: float = 1.2) -> tuple[np.ndarray, np.ndarray, n
     rng = np.random.default_rng((12, seed))
     shape, path = (400, 400), 13.0 * np.array([math.cos(seed), math.sin(seed)])
     places = 40.0 + 0.8 * scattered(9, shape, seed, gap=50.0)
-    steps = (np.arange(64) + 0.5) / 64 - 0.5
-    light = sum(
-        spot(shape, *(place + step * path), flux / 64, width)
-        for place, flux in zip(places, (500.0, 380.0, 260.0, 170.0, 150.0), strict=False)
-        for step in steps
-    )
-    light = light + sum(spot(shape, *place, 90.0) for place in places[5:])
+    light = trails(shape, places[:5], np.array([500.0, 380.0, 260.0, 170.0, 150.0]), path, width)
+    light = light + spots(shape, places[5:], 90.0)
     hot = rng.integers(0, 400, (40, 2))
     light[hot[:, 1], hot[:, 0]] += 150.0
     return photograph(light, seed), places[:3], path
@@ -322,10 +334,7 @@ def test_the_width_of_few_spots_is_measured_among_hot_pixels_beside_a_dark_body(
     for seed in range(30):
         rng = np.random.default_rng((13, seed))
         places = scattered(8, shape, seed, gap=40.0)
-        light = sum(
-            spot(shape, *place, flux, width)
-            for place, flux in zip(places, np.geomspace(600, 250, 8), strict=True)
-        )
+        light = spots(shape, places, np.geomspace(600, 250, 8), width)
         hot = rng.integers(0, 400, (40, 2))
         light[hot[:, 1], hot[:, 0]] += 150.0
         image = photograph(light, seed)
@@ -348,7 +357,7 @@ def test_a_dark_body_does_not_displace_the_stars_beside_it() -> None:
     for seed in range(20):
         rng = np.random.default_rng((14, seed))
         places = np.column_stack([rng.uniform(170.0, 192.0, 10), np.arange(20.0, 400.0, 38.0)])
-        image = photograph(sum(spot(shape, *place, 400.0, 1.2) for place in places), seed)
+        image = photograph(spots(shape, places, 400.0, 1.2), seed)
         image[:, 203:] = 0
         found = detect(image, KNOWN)
         number, _ = matched(found, places, 3.0)
@@ -361,8 +370,8 @@ def test_a_dark_body_does_not_displace_the_stars_beside_it() -> None:
 def test_two_streaks_among_few_round_stars_are_not_trails() -> None:
     shape = (300, 300)
     places = scattered(6, shape, 9, gap=40.0)
-    light = sum(spot(shape, *place, 900.0) for place in places[:4])
-    light = light + sum(trail(shape, *place, 4000.0, 9.0, 5.0) for place in places[4:])
+    light = spots(shape, places[:4], 900.0)
+    light = light + trails(shape, places[4:], 4000.0, np.array([9.0, 5.0]))
     found = detect(photograph(light), KNOWN)
     assert found.trail_px == 0.0
     assert np.all(matched(found, places[:4])[0] >= 0)
@@ -373,8 +382,8 @@ def test_trails_of_a_roll_are_followed() -> None:
     places = scattered(60, shape, 10, gap=30.0)
     roll = 0.03
     off = places - 199.5
-    trails = roll * np.column_stack([-off[:, 1], off[:, 0]])
-    light = sum(trail(shape, *place, 15000.0, *path) for place, path in zip(places, trails, strict=True))
+    paths = roll * np.column_stack([-off[:, 1], off[:, 0]])
+    light = trails(shape, places, 15000.0, paths)
     detections = detect(photograph(light), KNOWN)
     number, _ = matched(detections, places, 1.0)
     assert np.mean(number >= 0) > 0.95
@@ -386,7 +395,7 @@ def test_round_stars_have_no_trail() -> None:
     shape = (300, 300)
     places = scattered(50, shape, 11)
     for seed in range(5):
-        image = photograph(sum(spot(shape, *place, 700.0) for place in places), seed)
+        image = photograph(spots(shape, places, 700.0), seed)
         assert detect(image).trail_px == 0.0
 
 
@@ -397,7 +406,7 @@ def test_uneven_sky_does_not_move_stars() -> None:
     radius2 = ((columns - 300.0) ** 2 + (rows - 250.0) ** 2) / 390.0**2
     sky = 3000.0 * (1.0 - 0.5 * radius2) + 1.5 * columns
     places = scattered(80, shape, 12)
-    light = sum(spot(shape, *place, 900.0) for place in places)
+    light = spots(shape, places, 900.0)
     detections = detect(photograph(light, sky=sky), DetectionSettings())
     number, spurious = matched(detections, places)
     assert np.mean(number >= 0) > 0.97
@@ -410,7 +419,7 @@ def test_uneven_sky_does_not_move_stars() -> None:
 def test_a_bright_limb_hides_only_itself() -> None:
     shape = (400, 400)
     places = scattered(60, shape, 13)
-    light = sum(spot(shape, *place, 1500.0) for place in places)
+    light = spots(shape, places, 1500.0)
     rows = np.mgrid[0 : shape[0], 0 : shape[1]][0]
     light = np.where(rows > 260, 20000.0, light)
     found = detect(photograph(light), KNOWN)
@@ -423,7 +432,7 @@ def test_a_bright_limb_hides_only_itself() -> None:
 def test_other_spot_widths_are_estimated(sigma: float) -> None:
     shape = (400, 400)
     places = scattered(60, shape, 14, gap=22.0)
-    light = sum(spot(shape, *place, 6000.0, sigma) for place in places)
+    light = spots(shape, places, 6000.0, sigma)
     detections = detect(photograph(light), KNOWN)
     number, spurious = matched(detections, places)
     assert np.all(number >= 0)
@@ -440,8 +449,7 @@ def test_spots_that_grow_towards_the_corners_have_right_errors_there() -> None:
         places = scattered(100, shape, seed, gap=20.0)
         off2 = np.sum(np.square((places + 0.5) / 200.0 - 1.0), axis=1)
         widths = sigma * (1.0 + growth * off2)
-        spots = (spot(shape, *place, 600.0, width) for place, width in zip(places, widths, strict=True))
-        found = detect(photograph(sum(spots), seed), known)
+        found = detect(photograph(spots(shape, places, 600.0, widths), seed), known)
         assert found.psf_sigma_px == pytest.approx(sigma * (1.0 + growth * 2.0 / 3.0), rel=0.05)
         number, _ = matched(found, places)
         seen = number[number >= 0]
@@ -474,7 +482,7 @@ def test_star_sizes_can_be_limited() -> None:
 def test_at_most_max_stars() -> None:
     shape = (300, 300)
     places = scattered(40, shape, 15)
-    image = photograph(sum(spot(shape, *place, 500.0 + 50.0 * k) for k, place in enumerate(places)))
+    image = photograph(spots(shape, places, 500.0 + 50.0 * np.arange(40)))
     found = detect(image, DetectionSettings(max_stars=10))
     assert len(found) == 10
     assert found.flux.min() > np.median(detect(image).flux)
@@ -533,7 +541,7 @@ def test_bad_settings_are_rejected(values: dict[str, float]) -> None:
 
 def test_memory_layout_and_byte_order_do_not_matter() -> None:
     shape = (120, 150)
-    image = photograph(sum(spot(shape, *place, 1500.0) for place in scattered(10, shape, 16)))
+    image = photograph(spots(shape, scattered(10, shape, 16), 1500.0))
     plain = detect(image)
     big_endian = detect(image.astype(">u2"))
     columns_first = detect(np.asfortranarray(image))
