@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,7 @@ from starid.imaging.matched_filter import (
     find_peaks_in_bytes,
     integer_taps,
     noise_factor,
+    spot_noise_factor,
     spot_taps,
 )
 from starid.imaging.measurement import (
@@ -91,6 +92,7 @@ _OTHER_WIDTH: Final = 0.3
 _MISFIT_SIGMA: Final = 3.0
 _RELAXED_SHARE: Final = 0.8
 _MAX_NEIGHBOURS: Final = 64
+_AT_REST: Final = np.zeros(FLOW_TERMS)
 
 
 @dataclass(frozen=True)
@@ -245,6 +247,17 @@ class _Scene:
         return self.background.level, self.background.noise, float(self.background.block_px)
 
 
+class _Peaks(NamedTuple):
+    """Candidates (n, 2), highest first, their smoothed heights (n,) above the background, and the sky (n,) under peaks of one pixel.
+
+    The sky is NaN under the others.
+    """
+
+    peaks: Indices32
+    heights: Grid
+    sky: Array
+
+
 @dataclass(frozen=True)
 class _Fits:
     """Candidates with their windows and pixels, neighbours, fits and flags.
@@ -320,19 +333,19 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
     )
     background = estimate_background(counts, options.block_px)
     if background.median_level >= saturation:
-        found = _no_detections(background, "image is saturated all over: shorten the exposure")
-        return dataclasses.replace(found, searchable=False)
+        empty = _no_detections(background, "image is saturated all over: shorten the exposure")
+        return dataclasses.replace(empty, searchable=False)
     sigma = options.psf_sigma_px if options.psf_sigma_px is not None else _ASSUMED_SIGMA_PX
     scene = _Scene(counts, background, options, float(saturation))
-    peaks, heights = _peaks(scene, sigma)
-    shape = _shape_of_stars(scene, peaks, heights)
+    found = _peaks(scene, sigma)
+    shape = _shape_of_stars(scene, found)
     if options.psf_sigma_px is None and abs(shape.sigma_px / sigma - 1.0) > _OTHER_WIDTH:
-        peaks, heights = _peaks(scene, shape.sigma_px)
-        shape = _shape_of_stars(scene, peaks, heights, shape.sigma_px)
+        found = _peaks(scene, shape.sigma_px)
+        shape = _shape_of_stars(scene, found, shape.sigma_px)
     turning = shape if shape.trail_px > 0.0 and shape.stars < _STARS_FOR_SHAPE else None
     if turning is not None:
-        shape = _shape_of_stars(_at_rest(scene), peaks, heights, shape.sigma_px)
-    peaks, heights, hot = _without_hot_pixels(scene, peaks, heights, shape.sigma_px)
+        shape = _shape_of_stars(_at_rest(scene), found, shape.sigma_px)
+    peaks, heights, hot = _without_hot_pixels(found, shape.sigma_px)
     if shape.trail_px > _TRAIL_FILTER_PX:
         peaks, heights = _trail_peaks(scene, shape, hot)
     if len(peaks) + len(hot) == 0:
@@ -368,7 +381,14 @@ def _no_detections(background: Background, reason: str, rejected: int = 0) -> De
     return Detections(pairs, none, none, pairs, none, no, no, level, noise, 0.0, 0.0, rejected, reason)
 
 
-def _peaks(scene: _Scene, sigma_px: float) -> tuple[Indices32, Grid]:
+def _peaks(scene: _Scene, sigma_px: float) -> _Peaks:
+    peaks, heights = _smoothed_peaks(scene, sigma_px)
+    sky = np.empty(len(peaks))
+    sky_under_lone_pixels(scene.counts, peaks, *scene.grids, sky)
+    return _Peaks(peaks, heights, sky)
+
+
+def _smoothed_peaks(scene: _Scene, sigma_px: float) -> tuple[Indices32, Grid]:
     """Candidates (n, 2), highest first, and their smoothed heights above the background."""
     counts, background = scene.counts, scene.background
     bytes_taps = integer_taps(sigma_px)
@@ -386,25 +406,16 @@ def _peaks(scene: _Scene, sigma_px: float) -> tuple[Indices32, Grid]:
     def search(threshold: Grid, peaks: Indices32, heights: Grid) -> int:
         return find_peaks(image16, threshold, background.block_px, taps, peaks, heights)
 
-    return _search(search, background, scene.settings.threshold_sigma * noise_factor(taps))
+    return _search(search, background, scene.settings.threshold_sigma * spot_noise_factor(sigma_px))
 
 
-def _without_hot_pixels(
-    scene: _Scene, peaks: Indices32, heights: Grid, sigma_px: float
-) -> tuple[Indices32, Grid, Table]:
+def _without_hot_pixels(found: _Peaks, sigma_px: float) -> tuple[Indices32, Grid, Table]:
     """Drop hot pixels: return candidates, heights, and (n, 3) the hot pixels with the sky under them."""
+    peaks, heights, sky = found
     if sigma_px < MIN_SPREAD_PX:
         return peaks, heights, np.zeros((0, 3))
-    sky = _sky_under_lone_pixels(scene, peaks)
     hot = ~np.isnan(sky)
     return peaks[~hot], heights[~hot], np.column_stack([peaks[hot], sky[hot]])
-
-
-def _sky_under_lone_pixels(scene: _Scene, peaks: Indices32) -> Array:
-    """Background (n,) under peaks of one pixel, NaN for the others."""
-    sky = np.empty(len(peaks))
-    sky_under_lone_pixels(scene.counts, peaks, *scene.grids, sky)
-    return sky
 
 
 def _without_weight(scene: _Scene, hot: Table) -> _Scene:
@@ -453,22 +464,23 @@ def _search(
     return peaks[order], heights[order]
 
 
-def _shape_of_stars(
-    scene: _Scene, peaks: Indices32, heights: Grid, assumed: float = _ASSUMED_SIGMA_PX
-) -> SpotShape:
+def _shape_of_stars(scene: _Scene, found: _Peaks, assumed: float = _ASSUMED_SIGMA_PX) -> SpotShape:
     """Estimate spot and trails from peaks of several pixels that stand out of an even sky.
 
     Others may be hot pixels and edges of bodies: in an image with few stars they would be most of the objects, and the spot would
     seem too narrow. Without such peaks, all count.
     """
-    several = np.isnan(_sky_under_lone_pixels(scene, peaks))
-    some = _that_stand_out(scene, peaks, heights, several, _PEAKS_FOR_SHAPE, assumed)
-    for least, kept in ((_MIN_SCREENED, some), (_MIN_FOR_WIDTH, peaks[several])):
-        if len(kept) >= least:
-            shape = _estimate_shape(scene, kept, assumed, least)
-            if shape.stars > 0:
-                return shape
-    return _estimate_shape(scene, peaks, assumed, _MIN_FOR_WIDTH)
+    peaks, heights, sky = found
+    several = np.isnan(sky)
+    for most in (_STARS_FOR_SHAPE, _PEAKS_FOR_SHAPE):
+        some = _that_stand_out(scene, peaks, heights, several, most, assumed)
+        shape, complete = _estimate_shape(scene, some, assumed, _MIN_SCREENED)
+        if complete or len(some) < most:
+            break
+    for kept in (peaks[several], peaks):
+        if shape.stars == 0:
+            shape, _ = _estimate_shape(scene, kept, assumed, _MIN_FOR_WIDTH)
+    return shape
 
 
 def _at_rest(scene: _Scene) -> _Scene:
@@ -477,26 +489,43 @@ def _at_rest(scene: _Scene) -> _Scene:
 
 
 def _that_stand_out(
-    scene: _Scene, peaks: Indices32, heights: Grid, among: Mask, most: int, sigma_px: float
+    scene: _Scene,
+    peaks: Indices32,
+    heights: Grid,
+    among: Mask,
+    most: int,
+    sigma_px: float,
+    windows: Records | None = None,
 ) -> Indices32:
-    """Return the brightest peaks among some that stand out, `most` of them; only as many are examined as it takes."""
-    tried = most
+    """Return the brightest peaks among some that stand out, `most` of them; only as many are examined as it takes.
+
+    Given `windows` of the first peaks are not laid again.
+    """
+    if windows is None:
+        tried = most + most // 4
+        windows, _ = _windows_of(scene, peaks[:tried], heights[:tried], sigma_px, _AT_REST)
     while True:
-        tried += most // 4
-        stand_out = among[:tried] & _stand_out(scene, peaks[:tried], heights[:tried], sigma_px)
+        tried = len(windows)
+        stand_out = among[:tried] & _stand_out(scene, peaks[:tried], heights[:tried], windows, sigma_px)
         if tried >= len(peaks) or np.count_nonzero(stand_out) >= most:
             return peaks[:tried][stand_out][:most]
-        tried *= 2
+        windows, _ = _windows_of(scene, peaks[: 2 * tried], heights[: 2 * tried], sigma_px, _AT_REST)
 
 
-def _stand_out(scene: _Scene, peaks: Indices32, heights: Grid, sigma_px: float) -> Mask:
+def _windows_of(
+    scene: _Scene, peaks: Indices32, heights: Grid, sigma_px: float, flow: Array
+) -> tuple[Records, int]:
+    """Windows (n,) around peaks, and how many pixels they have together."""
+    windows = np.zeros(len(peaks), WINDOW)
+    flux = heights / np.float32(square(spot_noise_factor(sigma_px)))
+    spot = (sigma_px, scene.settings.psf_growth, scene.saturation, scene.background.median_noise)
+    return windows, lay_windows(scene.counts, peaks, flux, *scene.grids, spot, flow, windows)
+
+
+def _stand_out(scene: _Scene, peaks: Indices32, heights: Grid, windows: Records, sigma_px: float) -> Mask:
     """Which peaks (n,) are above the threshold over the sky in a ring around them, if it is even."""
     background = scene.background
-    windows = np.zeros(len(peaks), WINDOW)
-    spot = (sigma_px, scene.settings.psf_growth, scene.saturation, background.median_noise)
-    factor = noise_factor(spot_taps(sigma_px))
-    flux = heights / np.float32(square(factor))
-    lay_windows(scene.counts, peaks, flux, *scene.grids, spot, np.zeros(FLOW_TERMS), windows)
+    factor = spot_noise_factor(sigma_px)
     above = heights + _level_of_block(background, peaks) - windows["base"]
     even = windows["noise"] <= _EVEN_NOISE * background.median_noise
     threshold = scene.settings.threshold_sigma * factor * windows["noise"]
@@ -512,8 +541,11 @@ def _level_of_block(background: Background, peaks: Indices32) -> Grid:
     )
 
 
-def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float, least: int) -> SpotShape:
-    """Estimate spot and trails from the brightest unsaturated stars, the spot from at least `least`."""
+def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float, least: int) -> tuple[SpotShape, bool]:
+    """Estimate spot and trails from the brightest unsaturated stars, the spot from at least `least`.
+
+    Also return whether more peaks would not change the estimate, because as many stars as it takes were measured.
+    """
     settings = scene.settings
     height, width = scene.counts.shape
     start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
@@ -525,7 +557,8 @@ def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float, least: int)
             scene.counts, tries, *scene.level, start, _SHAPE_WINDOW_PX, scene.saturation, table
         )
         shape = shape_from_moments(table[:count], width, height, settings.psf_sigma_px, assumed)
-        if shape.trail_px == 0.0 or count < star_count:
+        complete = count == star_count
+        if shape.trail_px == 0.0 or not complete:
             break
     if not settings.follow_trails:
         shape = dataclasses.replace(shape, flow=np.zeros_like(shape.flow), trail_px=0.0)
@@ -534,9 +567,10 @@ def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float, least: int)
         fitted = spot_widths(
             scene.counts, tries, *scene.grids, start, scene.saturation, settings.psf_growth, widths
         )
+        complete &= fitted == widths.size
         if fitted >= least:
             shape = dataclasses.replace(shape, sigma_px=float(np.median(widths[:fitted])), stars=fitted)
-    return shape
+    return shape, complete
 
 
 def _moments(scene: _Scene, peaks: Indices32, shape: SpotShape) -> Table:
@@ -568,11 +602,12 @@ def _trails_or_spots(
     peaks, heights, hot = objects
     height, width = scene.counts.shape
     most_are_hot = len(hot) > len(peaks)
+    count = _PEAKS_FOR_TRAILS if most_are_hot or fits.suspicious else _STARS_FOR_SHAPE
     bright = np.ones(len(peaks), dtype=np.bool_)
     if not most_are_hot:
         bright[: len(fits.stars)] = fits.stars["state"] != FAINT
-    count = _PEAKS_FOR_TRAILS if most_are_hot or fits.suspicious else _STARS_FOR_SHAPE
-    table = _moments(scene, _that_stand_out(scene, peaks, heights, bright, count, shape.sigma_px), shape)
+    tries = _that_stand_out(scene, peaks, heights, bright, count, shape.sigma_px, fits.windows)
+    table = _moments(scene, tries, shape)
     longest = table[long_trails(table, shape.sigma_px)]
     if turning is None:
         least = _FEW_TRAILS if 2 * len(longest) >= len(table) else MIN_LONG
@@ -600,11 +635,8 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
     counts, background, settings = scene.counts, scene.background, scene.settings
     peaks, heights = peaks[: 2 * settings.max_stars], heights[: 2 * settings.max_stars]
     per_dn = 0.0 if settings.gain_e_per_dn is None else 1.0 / settings.gain_e_per_dn
-    flux = heights / np.float32(square(noise_factor(spot_taps(shape.sigma_px))))
     count = len(peaks)
-    windows = np.zeros(count, WINDOW)
-    spot = (shape.sigma_px, settings.psf_growth, scene.saturation, background.median_noise)
-    total = lay_windows(counts, peaks, flux, *scene.grids, spot, shape.flow, windows)
+    windows, total = _windows_of(scene, peaks, heights, shape.sigma_px, shape.flow)
     pixels = np.empty(total, dtype=np.float32)
     cut_windows(counts, windows, *scene.level, scene.saturation, pixels)
     first = np.empty(count + 1, dtype=np.int32)

@@ -50,6 +50,12 @@ def noise_factor(taps: npt.NDArray[np.floating]) -> float:
     return float(square(taps[0]) + 2.0 * np.sum(square(taps[1:]), dtype=np.float64))
 
 
+@lru_cache(maxsize=4)
+def spot_noise_factor(sigma_px: float) -> float:
+    """`noise_factor` of `spot_taps`."""
+    return noise_factor(spot_taps(sigma_px))
+
+
 def integer_taps(sigma_px: float) -> npt.NDArray[np.uint16] | None:
     """Right half (3,) of an integer filter close to `spot_taps`, centre first; None if there is none.
 

@@ -232,13 +232,13 @@ def long_trails(table: Array, sigma_px: float) -> Mask:
     return np.asarray(trail_length(mean + split, square(sigma_px) + _PIXEL_VARIANCE) > _LONG_PX, dtype=bool)
 
 
-def trails_among_round(table: Array, width: int, height: int, shape: SpotShape, least: int) -> SpotShape:
+def trails_among_round(longest: Array, width: int, height: int, shape: SpotShape, least: int) -> SpotShape:
     """Find trails where most objects are round and not stars: particles, hot pixels, reflections.
 
     Parameters
     ----------
-    table : ndarray (n, 5)
-        Moments, as in `shape_from_moments`.
+    longest : ndarray (n, 5)
+        Moments, as in `shape_from_moments`, of the elongated objects (`long_trails`).
     width, height : int
         Size of the image.
     shape : SpotShape
@@ -246,7 +246,6 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape, 
     least : int
         Least number of those that agree.
     """
-    longest = table[long_trails(table, shape.sigma_px)]
     if len(longest) < least:
         return shape
     trail = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
@@ -286,14 +285,14 @@ def _sigma(variance: float, known: float | None) -> float:
 
 @lru_cache(maxsize=1)
 def _box_share() -> tuple[Array, Array]:
-    """Half-length z of a box in sigmas of a Gaussian weight, and 1 − 2zφ(z)/(2Φ(z) − 1) for it."""
+    """Half-length z of a box in sigmas of a Gaussian weight, from 0, and 1 − 2zφ(z)/(2Φ(z) − 1) for it."""
     z = np.linspace(1e-3, 4.0, 2000)
     # Φ(z) − ½ = φ(z) (z + z³/3 + z⁵/15 + …)
     term, series = z, np.zeros_like(z)
     for k in range(3, _SERIES_END, 2):
         term = term * square(z) / k
         series += term
-    return z, series / (z + series)
+    return np.append(0.0, z), np.append(0.0, series / (z + series))
 
 
 def trail_length(along: Array, across: float) -> Array:
@@ -305,5 +304,5 @@ def trail_length(along: Array, across: float) -> Array:
     """
     ratio = np.maximum(along / across, 1.0)
     z, share = _box_share()
-    cut = interpolated((ratio - 1.0) / (2.0 * ratio), np.append(0.0, share), np.append(0.0, z))
+    cut = interpolated((ratio - 1.0) / (2.0 * ratio), share, z)
     return np.asarray(2.0 * cut * np.sqrt(ratio + 1.0) * math.sqrt(across), dtype=np.float64)

@@ -78,6 +78,9 @@ ONE_PIXEL: Final = -4
 
 _MAX_PATCHES: Final = 1000
 _RING_PIXELS: Final = 48
+_RING: Final = np.array(
+    [[each(2.0 * math.pi * k / _RING_PIXELS) for k in range(_RING_PIXELS)] for each in (cos, sin)]
+)
 _RING_SHIFT_SIGMA: Final = 0.6
 _BLOCK_OF_MORE_THAN_SKY: Final = 1.5
 _RING_OF_MORE_THAN_SKY: Final = 2.0
@@ -115,7 +118,6 @@ def _ring_statistics(
     radius_x: int,
     radius_y: int,
     slopes: tuple[float, float],
-    circle: Array,
     values: Array,
 ) -> tuple[float, float]:
     """Mean of the middle half, and standard deviation from the quartiles, of pixels on a ring around a window.
@@ -126,8 +128,8 @@ def _ring_statistics(
     count = 0
     for k in range(_RING_PIXELS):
         out = 1.5 if k % 2 == 0 else 3.0
-        column = x + math.floor((radius_x + out) * circle[0, k] + 0.5)
-        row = y + math.floor((radius_y + out) * circle[1, k] + 0.5)
+        column = x + math.floor((radius_x + out) * _RING[0, k] + 0.5)
+        row = y + math.floor((radius_y + out) * _RING[1, k] + 0.5)
         if 0 <= column < width and 0 <= row < height:
             key = image[row, column] - slopes[0] * (column - x) - slopes[1] * (row - y)
             j = count - 1
@@ -302,10 +304,6 @@ def lay_windows(
     height, width = image.shape
     sigma, growth, saturation, typical_noise = spot
     ring = np.empty(_RING_PIXELS)
-    circle = np.empty((2, _RING_PIXELS))
-    for k in range(_RING_PIXELS):
-        circle[0, k] = cos(2.0 * math.pi * k / _RING_PIXELS)
-        circle[1, k] = sin(2.0 * math.pi * k / _RING_PIXELS)
     visited = np.empty((2 * PATCH_REACH + 1, 2 * PATCH_REACH + 1), np.uint8)
     stack = np.empty((2 * MAX_SATURATED, 2), np.int32)
     patches = np.empty((_MAX_PATCHES, 7))
@@ -332,7 +330,7 @@ def lay_windows(
         radius_y = min(math.ceil(radius + 0.5 * abs(trail_y) + extra), LARGEST_HALF_WIDTH)
         centre_x, centre_y = round(x), round(y)
         slopes = _slopes(level, block, x, y)
-        around, spread = _ring_statistics(image, centre_x, centre_y, radius_x, radius_y, slopes, circle, ring)
+        around, spread = _ring_statistics(image, centre_x, centre_y, radius_x, radius_y, slopes, ring)
         sky_level, window.noise = _sky_under(
             around,
             spread,
