@@ -23,6 +23,8 @@ ZERO_POINT = 20.3
 LIMIT = 6.0
 SENSOR = {"zero_point": ZERO_POINT, "detected_limit": LIMIT, "magnitude_sigma": 0.03}
 FRAMES = 30
+ABLATED = 16
+"""The same without a part: a search that fails takes many times as long."""
 CHANCE = 1e-4
 """Probability with which a test may fail, or an ablation may seem to cost something, by chance."""
 COST = 0.25
@@ -68,11 +70,15 @@ def identifier(kind, refinement, part=None):
     )
 
 
-def lost_in_space(part=None, refinement=True, images=FRAMES):
+def frames_of(part):
+    return ABLATED if part else FRAMES
+
+
+def lost_in_space(part=None, *, refinement=True, images=None):
     """Errors of the boresight in degrees at random attitudes; NaN if invalid."""
     rng, rsi = np.random.default_rng(41), identifier(RsiIdentifier, refinement, part)
     errors = []
-    for _ in range(images):
+    for _ in range(images or frames_of(part)):
         attitude = random_attitude(rng)
         rsi.reset()
         solution = rsi.identify(*image(rng, attitude))
@@ -94,7 +100,7 @@ def slew(rate_deg, false_stars=0, part=None):
         attitude = random_attitude(rng)
         rsi.reset()
         predicted = None
-        for _ in range(FRAMES // 2):
+        for _ in range(frames_of(part) // 2):
             attitude = propagate(attitude, np.radians([0.0, rate_deg, 0.0]), 1.0)
             xy, flux = image(rng, attitude, false_stars)
             solution = rsi.identify(xy, flux) if predicted is None else rsi.track(xy, flux, predicted)
@@ -115,9 +121,10 @@ def least(share):
 
 
 def costs(intact, ablated):
-    """Whether an ablation takes away at least a quarter of a count, and not by chance (Fisher's exact test)."""
-    table = [[intact, FRAMES - intact], [ablated, FRAMES - ablated]]
-    return ablated <= (1.0 - COST) * intact and fisher_exact(table, alternative="greater").pvalue < CHANCE
+    """Whether an ablation takes away at least a quarter of a share, and not by chance (Fisher's exact test)."""
+    table = [[intact, FRAMES - intact], [ablated, ABLATED - ablated]]
+    significant = fisher_exact(table, alternative="greater").pvalue < CHANCE
+    return ablated / ABLATED <= (1.0 - COST) * intact / FRAMES and significant
 
 
 def test_features_of_another_image_find_nothing():
