@@ -29,6 +29,7 @@ from starhil.emulator.cli.options import (
 from starhil.emulator.cli.termination import ended_by_signals
 from starhil.emulator.console.recorders import RECORDERS
 from starhil.emulator.errors import EmulatorError
+from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starid.cli.output import compiling_reported, output_help, prepare_output
 
 if TYPE_CHECKING:
@@ -318,13 +319,12 @@ def command(
             "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
         )
     options = around.run_options()
-    for each in profiles:
-        if unit := each.lent_to:
-            print(
-                f"note: camera, sensor and parameters of the unit {unit} are those of the profile {each.name_or_path}; give a "
-                "profile of your own to change them (starhil docs profile)",
-                file=sys.stderr,
-            )
+    if profile is None and not head and (unit := profiles[0].unit_source) != DEFAULT_UNIT:
+        print(
+            f"note: camera, sensor and parameters of the unit {unit} are those of the profile {DEFAULT_PROFILE}; name a profile to "
+            "change them (starhil docs profile)",
+            file=sys.stderr,
+        )
     return run_loop(_serve(lambda: Emulator(profiles, options, worker)))
 
 

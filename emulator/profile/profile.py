@@ -184,13 +184,6 @@ class Profile(Strict):
         return path.stem if path is not None and bundled("profile").get(path.stem) == path else self.source
 
     @property
-    def lent_to(self) -> str:
-        """The unit to which an option gives a bundled profile of another one; empty if it is nobody else's."""
-        files = [values for source, values in self._layers if source.startswith("profile ")]
-        own = next((values["unit"] for values in reversed(files) if "unit" in values), DEFAULT_UNIT)
-        return "" if self.unit == own or self.name_or_path not in bundled("profile") else self.unit_source
-
-    @property
     def unit_source(self) -> str:
         """The unit for `load_unit`: name of a bundled unit, or a folder relative to the profile."""
         if self.unit in bundled_units():

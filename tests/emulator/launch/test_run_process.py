@@ -312,12 +312,14 @@ def test_a_catalogue_that_the_pipeline_cannot_read_ends_in_one_line_and_status_2
     check_rejected(["--set", "catalog.path=/no/such/file"], "/no/such/file")
 
 
-def test_a_profile_that_is_not_for_the_unit_is_noted():
-    status, _, err = run_command_line("run", "--can", "off", "--serial", "/dev/no_such_tty", "--unit", "nos3")
+def test_a_unit_that_gets_the_sensor_of_the_default_profile_is_noted():
+    words = ("--can", "off", "--serial", "/dev/no_such_tty", "--unit", "nos3")
+    assert "note:" not in run_command_line("run", "ideal", *words)[2]
+    status, _, err = run_command_line("run", *words)
     note, error = log_lines(err)
     assert note == (
-        "note: camera, sensor and parameters of the unit nos3 are those of the profile cubestar; give a profile of your own to "
-        "change them (starhil docs profile)"
+        "note: camera, sensor and parameters of the unit nos3 are those of the profile cubestar; name a profile to change them "
+        "(starhil docs profile)"
     )
     assert (status, error[:9]) == (2, "starhil: ")
 

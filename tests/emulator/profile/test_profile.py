@@ -40,17 +40,6 @@ def test_every_profile_of_the_product_is_valid(name):
     assert load_profile(name).name == name
 
 
-def test_a_bundled_profile_knows_the_unit_to_which_an_option_gives_it(tmp_path):
-    own = write(tmp_path, 'extends = "cubestar"\n')
-    given = {
-        (name, unit): load_profile(name, [f'unit="{unit}"']).lent_to
-        for name in ("cubestar", "ideal", own)
-        for unit in ("cubestar", "nos3")
-    }
-    assert {key for key, unit in given.items() if unit} == {("cubestar", "nos3"), ("ideal", "nos3")}
-    assert load_profile().lent_to == ""
-
-
 def test_a_profile_is_named_as_it_is_loaded(tmp_path):
     own = write(tmp_path, "")
     assert [load_profile(name).name_or_path for name in ("ideal", own)] == ["ideal", own]
