@@ -190,14 +190,34 @@ def test_a_damaged_file_is_removed(cache_folder: Path, change: Callable[[bytes],
     assert (good.exists(), bad.exists()) == (True, False)
 
 
-def test_a_kernel_whose_machine_code_is_damaged_is_compiled_again(package: Path, cache_folder: Path) -> None:
+@pytest.fixture(scope="module")
+def repaired(first_process: Path, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """What two processes, of umask 0, have printed and left of a cache with damaged machine code, long unused before the second."""
+    cache = tmp_path_factory.mktemp("repaired") / "cache"
+    shutil.copytree(first_process / "cache", cache)
+    reached = reached_by_others(cache)
     damages = {".nbi": truncated, ".nbc": zeroed}
-    files = machine_code(cache_folder)
+    files = machine_code(cache)
     assert {path.suffix for path in files} == set(damages)
     for file in files:
         damage(file, damages[file.suffix])
-    assert run(package) == ["2.5", "0"], "compiled again"
-    assert run(package) == ["2.5", "1"], "and kept"
+    write_package(first_process)
+    with pytest.MonkeyPatch.context() as context:
+        context.setenv(CACHE, str(cache))
+        printed = [run(first_process, umask=0)]
+        for each in cached_files():
+            os.utime(each.path, (1000, 1000))
+        printed.append(run(first_process, umask=0))
+        used_s = [each.used_s for each in cached_files()]
+    return SimpleNamespace(cache=cache, printed=printed, used_s=used_s, reached_before=reached)
+
+
+def test_a_kernel_whose_machine_code_is_damaged_is_compiled_again(repaired: SimpleNamespace) -> None:
+    assert repaired.printed == [["2.5", "0"], ["2.5", "1"]], "compiled again, and kept"
+
+
+def test_loaded_machine_code_counts_as_used(repaired: SimpleNamespace) -> None:
+    assert any(used_s > 1000 for used_s in repaired.used_s)
 
 
 def test_a_file_that_a_running_process_has_replaced_is_kept(cache_folder: Path) -> None:
@@ -310,15 +330,11 @@ def reached_by_others(cache_folder: Path) -> list[Path]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no umask there")
-def test_others_cannot_change_kernels_whatever_the_umask(package: Path, cache_folder: Path) -> None:
+def test_others_cannot_change_kernels_whatever_the_umask(repaired: SimpleNamespace) -> None:
     """In a folder made with mode 755, the kernels of a process with umask 0 could be replaced by anybody."""
-    assert len(reached_by_others(cache_folder)) > 3
-    for path in machine_code(cache_folder):
-        path.unlink()
-    for loaded in "01":
-        assert run(package, umask=0) == ["2.5", loaded]
-    assert machine_code(cache_folder)
-    assert not [path for path in reached_by_others(cache_folder) if path.stat().st_mode & 0o022]
+    assert len(repaired.reached_before) > 3
+    assert machine_code(repaired.cache)
+    assert not [path for path in reached_by_others(repaired.cache) if path.stat().st_mode & 0o022]
 
 
 def test_a_cache_that_can_only_be_read_is_used(
@@ -365,20 +381,15 @@ def test_the_machine_code_of_former_sources_is_evicted_beyond_the_limit(
     assert new != old
 
 
-def test_loaded_machine_code_counts_as_used(package: Path) -> None:
-    for each in cached_files():
-        os.utime(each.path, (1000, 1000))
-    assert run(package) == ["2.5", "1"]
-    assert any(each.used_s > 1000 for each in cached_files())
-
-
-def test_clearing_the_cache_removes_machine_code(package: Path) -> None:
+@pytest.mark.usefixtures("package")
+def test_clearing_the_cache_removes_machine_code(cache_folder: Path) -> None:
+    assert machine_code(cache_folder)
     files = cached_files()
     assert all(each.size > 0 for each in files)
     assert files
     assert all(remove(each) for each in files)
     assert cached_files() == []
-    assert run(package) == ["2.5", "0"]
+    assert machine_code(cache_folder) == []
 
 
 @inner_checked
