@@ -22,9 +22,10 @@ def main() -> None:
             for number in (signal.SIGTERM, signal.SIGHUP):
                 if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
                     signal.signal(number, _end)
-            from starhil.emulator.sensor.pipeline.worker_process import start_ahead
+            if not any("run.worker=" in word for word in sys.argv):
+                from starhil.emulator.sensor.pipeline.worker_process import start_ahead
 
-            start_ahead()  # the worker takes longest to start, so it is started before the imports of this process
+                start_ahead()  # the worker takes longest to start, so it is started before the imports of this process
         from starhil.emulator.cli.app import main as run
     except KeyboardInterrupt:
         raise SystemExit(130) from None

@@ -289,13 +289,10 @@ def command(
     `ready serial=… can=… unit=… profile=… seed=…`. The exit status is 1 if a log, a recording or the state could not be
     written, for example because the disk is full; the run goes on without it.
     """
-    from starhil.emulator.sensor.pipeline.worker_process import take_worker
-
-    worker = take_worker()  # first, to start up in parallel with the imports below
-
     from starhil.emulator.launch import Emulator, with_own_seeds
     from starhil.emulator.links.table import LINKS
     from starhil.emulator.profile import DEFAULT_PROFILE
+    from starhil.emulator.sensor.pipeline.worker_process import take_worker
     from starhil.emulator.simulation.threads import run_loop
 
     levels = ("debug", "info", "warning", "error")
@@ -325,7 +322,7 @@ def command(
             "change them (starhil docs profile)",
             file=sys.stderr,
         )
-    return run_loop(_serve(lambda: Emulator(profiles, options, worker)))
+    return run_loop(_serve(lambda: Emulator(profiles, options, take_worker())))
 
 
 async def _serve(make: Callable[[], Emulator]) -> int:

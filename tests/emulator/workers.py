@@ -18,10 +18,6 @@ setup = receive()
 """
 """The beginning of a worker that renders no images: what it does then is the test's."""
 
-NEVER_READY = (
-    "import socket, sys\nlink = socket.socket(fileno=int(sys.argv[1]))\nwhile link.recv(4096):\n    pass\n"
-)
-
 ANSWERING = (
     WORKER
     + f"send(PipelineReady({CAMERA}, 5, 0.0))\nn = 0\nwhile receive():\n n += 1\n send(FrameResult(n))\n"

@@ -54,11 +54,11 @@ class WorkerProcess:
         )
         inherited.close()
 
-    def end(self) -> None:
-        """Close the socket, which ends the worker, and wait; kill it if it does not end."""
+    def end(self, grace_s: float = EXIT_GRACE_S) -> None:
+        """Close the socket, which ends the worker, and wait; kill it if it does not end in time."""
         self.socket.close()
         try:
-            self.process.wait(EXIT_GRACE_S)
+            self.process.wait(grace_s)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
@@ -75,6 +75,6 @@ def start_ahead() -> None:
         _ahead.append(WorkerProcess())
 
 
-def take_worker() -> WorkerProcess:
-    """Return the worker started by `start_ahead`, or a new one."""
-    return _ahead.pop() if _ahead else WorkerProcess()
+def take_worker() -> WorkerProcess | None:
+    """Return the worker started by `start_ahead`, once."""
+    return _ahead.pop() if _ahead else None

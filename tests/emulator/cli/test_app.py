@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,7 +15,6 @@ from starhil.emulator.cli import app
 from starhil.emulator.cli.run import DeviceOptions
 from starhil.protocol.files.bundled import find_unit
 from tests.emulator.cli.command_line import run_command_line
-from tests.emulator.workers import NEVER_READY
 
 pytestmark = pytest.mark.lowest("typer")
 
@@ -52,9 +50,8 @@ def test_an_operating_system_error_is_one_line_and_status_2(
 
 
 def test_a_recording_without_the_package_of_its_extra_is_rejected_before_the_start(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, worker: Callable[..., object]
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    worker(NEVER_READY)
     monkeypatch.setitem(sys.modules, "mcap", None)  # as if it were not installed
     monkeypatch.delitem(sys.modules, "mcap.writer", raising=False)
     status, out, err = run_command_line(

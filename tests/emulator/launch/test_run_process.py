@@ -21,7 +21,6 @@ from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
-from tests.emulator.workers import NEVER_READY
 from tests.process.conftest import NO_IMAGES_OPTIONS
 from tests.protocol.serial.composed_links import CUBESTAR
 from tests.waiting import PATIENCE_S, wait_until
@@ -303,9 +302,8 @@ def test_the_worker_ends_with_a_killed_emulator_and_the_next_one_takes_its_place
         (["--set", "truth.kind=file", "--set", "truth.path=gone.csv"], "gone.csv"),
     ],
 )
-def test_bad_input_ends_in_one_line_and_status_2(arguments, said, worker):
-    worker(NEVER_READY)  # what is bad is found without a pipeline, which would load kernels meanwhile
-    check_rejected(arguments, said)
+def test_bad_input_ends_in_one_line_and_status_2(arguments, said):
+    check_rejected([*arguments, *NO_IMAGES_OPTIONS], said)
 
 
 def test_a_catalogue_that_the_pipeline_cannot_read_ends_in_one_line_and_status_2():
@@ -334,7 +332,7 @@ def check_rejected(arguments, message):
 
 def test_signals_to_an_emulator_that_ends_do_not_change_its_status():
     """Sent until the process is gone: one in its last tenth of a second ended it by the signal."""
-    emulator = Emulator("--clock", "stepped")
+    emulator = Emulator("--clock", "stepped", *NO_IMAGES_OPTIONS)
     emulator.do("quit")
     os.close(emulator.fd)
     emulator.control.close()

@@ -7,6 +7,8 @@ import sys
 
 import pytest
 
+from starhil.emulator.profile import load_profile
+from starhil.emulator.profile.pipeline_setup import make_pipeline
 from starhil.emulator.sensor.pipeline.worker_process import WorkerProcess
 from tests.waiting import PATIENCE_S
 
@@ -45,9 +47,14 @@ def test_a_signal_before_the_event_loop_ends_a_run_as_a_later_one_does(number):
 @pytest.mark.process
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [(["run", "demo"], "worker False False"), (["run", "--help"], "Usage"), ([], "Usage")],
+    [
+        (["run", "demo"], "worker False False"),
+        (["run", "--help"], "Usage"),
+        (["run", "gone", "--set", "run.worker=error_model"], "'gone': not found"),
+        ([], "Usage"),
+    ],
 )
-def test_only_a_run_starts_its_worker_before_anything_else_is_imported(arguments, said):
+def test_only_a_run_with_a_worker_starts_it_before_anything_else_is_imported(arguments, said):
     ended = python(AHEAD.format(arguments=arguments))
     assert said in ended.stdout + ended.stderr
     assert ("worker" in ended.stdout.split()) == (said.startswith("worker"))
@@ -78,5 +85,12 @@ def test_a_worker_that_was_started_ahead_is_taken_once(monkeypatch):
     monkeypatch.setattr(worker_process, "WorkerProcess", object)
     worker_process.start_ahead()
     first, second = worker_process.take_worker(), worker_process.take_worker()
-    assert first is not second
-    assert worker_process._ahead == []
+    assert (type(first), second) == (object, None)
+
+
+@pytest.mark.process
+def test_a_worker_that_a_run_does_not_need_is_not_waited_for():
+    """It went on to import numba and numpy, and the run waited two seconds for it."""
+    worker = WorkerProcess()
+    make_pipeline(load_profile("ideal", ["run.worker=error_model"]), worker, repeatable=False, previews=False)
+    assert worker.process.returncode == -signal.SIGKILL
