@@ -39,14 +39,15 @@ AGREES_ARCSEC = 5.0
 """Largest difference from the truth, arcseconds: errors of the ideal sensor, and digits of 1e-6 in the report."""
 
 
-def build(folder: Path) -> Path:
+def build(folder: Path, *flags: str) -> Path:
     """Compile the flight computer with the exported codec; return the program."""
     for name, text in export_folder(load_unit(), "c").items():
         (folder / name).write_text(text, encoding="utf-8")
     program = folder / "obc.elf"
     sources = [SOURCE / "obc.c", *folder.glob("*.c")]
     subprocess.run(
-        [COMPILER, *FLAGS, f"-I{folder}", "-T", SOURCE / "obc.ld", "-o", program, *sources], check=True
+        [COMPILER, *FLAGS, *flags, f"-I{folder}", "-T", SOURCE / "obc.ld", "-o", program, *sources],
+        check=True,
     )
     return program
 
@@ -131,7 +132,8 @@ def main() -> int:
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     guest = () if options.icount is None else ("-icount", f"shift={options.icount},sleep=off")
-    status, report, seconds = run(build(options.out), options.link, options.clock, options.out, guest)
+    program = build(options.out, *(() if options.icount is None else ("-DBUSY",)))
+    status, report, seconds = run(program, options.link, options.clock, options.out, guest)
     print(report, end="")
     if elapsed := re.search(r"elapsed_ms (\d+)", report):
         print(f"real-time factor of the flight computer: {int(elapsed[1]) / 1e3 / seconds:.2f}")

@@ -27,23 +27,36 @@ typedef struct {
 #define GROUND ((uart_t *)0x40005000u)
 #define TX_FULL 1u
 #define RX_FULL 2u
+#define RX_INTERRUPT 8u
 static volatile uint32_t *const systick = (volatile uint32_t *)0xE000E010u; /* control, reload, value */
+static volatile uint32_t *const enabled = (volatile uint32_t *)0xE000E100u; /* interrupts: 0 is a byte of UART 0 */
 
 static volatile uint32_t now_ms;
 
 static void tick(void) { ++now_ms; }
 
+static void byte_came(void) { TRACKER->interrupts = RX_FULL; }
+
+static void wait(void) /* for the next tick, or a byte */
+{
+#ifndef BUSY /* the time of instructions does not pass while it sleeps */
+    __asm__ volatile("wfi");
+#endif
+}
+
 static void fault(void) { _Exit(1); }
 
 extern uint32_t stack_top;
 void _start(void); /* of newlib: clears memory, calls main, and ends the machine with its result, by semihosting */
-__attribute__((section(".vectors"), used)) static void (*const vectors[16])(void) = {
-    (void (*)(void))(&stack_top), _start, fault, fault, fault, fault, fault, 0, 0, 0, 0, fault, fault, 0, fault, tick};
+__attribute__((section(".vectors"), used)) static void (*const vectors[17])(void) = {
+    (void (*)(void))(&stack_top), _start, fault, fault, fault, fault, fault, 0, 0, 0, 0, fault, fault, 0, fault, tick, byte_came};
 
 static void start_board(void)
 {
     TRACKER->divider = GROUND->divider = CLOCK_HZ / 115200u;
-    TRACKER->control = GROUND->control = 3u; /* send and receive */
+    GROUND->control = 3u; /* send and receive */
+    TRACKER->control = 3u | RX_INTERRUPT;
+    *enabled = 1u;
     systick[1] = CLOCK_HZ / 1000u - 1u;
     systick[2] = 0u;
     systick[0] = 7u; /* core clock, interrupt, on */
@@ -91,6 +104,8 @@ static int ask(uint8_t id, const uint8_t *data, size_t size, cubestar_message_t 
                 slowest_ms = took_ms > slowest_ms ? took_ms : slowest_ms;
                 return kind;
             }
+        } else {
+            wait();
         }
     }
     ++missing;
@@ -104,6 +119,8 @@ static void drain(void)
         if ((TRACKER->state & RX_FULL) != 0u) {
             (void)TRACKER->data;
             begin_ms = now_ms;
+        } else {
+            wait();
         }
     }
 }
@@ -153,7 +170,7 @@ int main(void)
     late = missing = slowest_ms = 0u;
     while (valid < WANTED && now_ms < LIMIT_MS) {
         while ((int32_t)(now_ms - due_ms) < 0) {
-            __asm__ volatile("wfi"); /* until the next tick */
+            wait();
         }
         due_ms = now_ms + CYCLE_MS;
         if (!read_attitude(&attitude) || !attitude.valid) {
