@@ -44,7 +44,7 @@ from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from tests.emulator.cli.command_line import run_command_line
-from tests.process.conftest import NO_IMAGES_OPTIONS
+from tests.process.conftest import NO_IMAGES, NO_IMAGES_OPTIONS
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.long
@@ -320,7 +320,7 @@ def unit(bus, tmp_path_factory):
         serial="auto",
         can=bus,
         seed=1,
-        settings=["parameters.start_mode=lost_in_space"],
+        settings=["parameters.start_mode=lost_in_space", *NO_IMAGES],
         state_dir=tmp_path_factory.mktemp("state"),
         extra=["--canopen", "5"],
     )

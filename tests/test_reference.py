@@ -18,6 +18,7 @@ from starhil.hil_tests.session.script import load_script
 from starhil.protocol.export import export
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
+from tests.process.conftest import NO_IMAGES
 from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).parents[1]
@@ -212,7 +213,7 @@ def test_the_control_channel_answers_as_the_page_shows():
     text = (DOCS / "control.md").read_text(encoding="utf-8")
     pairs = re.findall(r"^→ (.*)\n← (.*)$", text, re.MULTILINE)
     assert len(pairs) == 2
-    command = emulator_command(extra=["--control", "auto", "--clock", "stepped"])
+    command = emulator_command(settings=NO_IMAGES, extra=["--control", "auto", "--clock", "stepped"])
     with EmulatorProcess(command) as emulator, socket.socket(socket.AF_UNIX) as channel:
         channel.settimeout(PATIENCE_S)
         channel.connect(emulator.ready["control"].removeprefix("unix:"))

@@ -12,6 +12,7 @@ from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.unit import load_unit
 from tests.candump import read_candump
+from tests.process.conftest import NO_IMAGES
 from tests.process.test_sessions import starhil
 from tests.protocol.export.dissection import dissect
 from tests.waiting import PATIENCE_S
@@ -72,10 +73,11 @@ def test_no_frame_of_sessions_with_a_canopen_node_is_malformed(tmp_path):
     with EmulatorProcess([*hub_command(), "--log", str(recording)]) as hub:
         channel = hub.ready["can"]
         command = emulator_command(
+            profile="ideal",
             serial="off",
             can=channel,
             seed=1,
-            settings=["truth.attitude.roll_deg=30"],  # what first_light expects
+            settings=["truth.attitude.roll_deg=30", *NO_IMAGES],  # what first_light expects
             state_dir=tmp_path / "state",
             extra=["--canopen", str(NODE)],
         )

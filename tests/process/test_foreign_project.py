@@ -22,7 +22,7 @@ PACKAGES = {
     **{name: f"starhil/{name}" for name in ("emulator", "protocol", "hil_tests", "configs")},
 }
 """Where the files of each folder are in the wheel."""
-QUICK = 'extends = "cubestar"\n[run]\nworker = "error_model"\n'
+QUICK = 'extends = "cubestar"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
 """Profile without images: kernels of another installation would be compiled for a minute, as those of the first start."""
 OUR_ROOMS = ("emulator", "protocol", "hil_tests", "configs", "tools", "tests")
 

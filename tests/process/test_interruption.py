@@ -14,6 +14,7 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
+from tests.process.conftest import NO_IMAGES_OPTIONS
 from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
@@ -127,7 +128,8 @@ def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tm
         "from starhil.emulator.cli.app import main\n"
         "from starhil.emulator.truth import reading_process\n"
         f"reading_process.read_truth_file = lambda *_: (open({str(reading)!r}, 'w').close(), time.sleep(1e6))\n"
-        f"sys.argv[1:] = ['run', 'demo', '--serial', 'off', '--can', 'off', '--control', 'unix:{control}']\n"
+        "sys.argv[1:] = ['run', 'ideal', '--serial', 'off', '--can', 'off', "
+        f"'--control', 'unix:{control}', *{NO_IMAGES_OPTIONS}]\n"
         "sys.exit(main())\n"
     )
     with (

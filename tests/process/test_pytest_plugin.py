@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from tests.process.conftest import NO_IMAGES
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
@@ -20,11 +21,18 @@ README_TEST, _ = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_te
 COUNT = PAGE_TESTS.count("def test_")
 
 
-def run_pytest(folder: Path, programs: str | dict[str, str], *options: str) -> str:
+QUICK = 'extends = "ideal"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
+"""Profile of the emulators whose images do not matter."""
+
+
+def run_pytest(folder: Path, programs: str | dict[str, str], *options: str, profile: str = QUICK) -> str:
     """Run programs of tests in a separate pytest; return its output."""
     files = programs if isinstance(programs, dict) else {"test_it.py": programs}
     for name, program in files.items():
         (folder / name).write_text(program)
+    if profile:
+        (folder / "quick.toml").write_text(profile)
+        options = ("--starhil-profile=quick.toml", *options)
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-rs", "-v", *options, *files]
     done = subprocess.run(
         command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False
@@ -33,11 +41,13 @@ def run_pytest(folder: Path, programs: str | dict[str, str], *options: str) -> s
 
 
 def test_the_example_of_the_readme_passes(tmp_path):
-    assert "1 passed" in run_pytest(tmp_path, README_TEST)
+    assert "1 passed" in run_pytest(tmp_path, README_TEST, profile="")
 
 
 def test_what_a_unit_on_a_serial_line_lacks_is_skipped_by_name(tmp_path):
-    with EmulatorProcess(emulator_command(profile="ideal", state_dir=tmp_path / "unit")) as unit:
+    with EmulatorProcess(
+        emulator_command(profile="ideal", settings=NO_IMAGES, state_dir=tmp_path / "unit")
+    ) as unit:
         out = run_pytest(tmp_path, PAGE_TESTS, "--starhil-serial", unit.ready["serial"])
     assert "1 passed, 4 skipped" in out
     assert "test_an_attitude_is_found PASSED" in out
@@ -64,7 +74,7 @@ def test_one(starhil_serial, starhil_control, starhil_truth):
     assert starhil_control.do("truth")["ra_deg"] == pytest.approx(10.0)
 
 def test_another(starhil_serial, starhil_control):
-    assert starhil_serial.get_parameter("exposure") == 300
+    assert starhil_serial.get_parameter("exposure") == 100
     assert starhil_serial.read("device_status")["mode"] == "standby"
     assert starhil_control.do("status")["faults"] == {}
     assert starhil_control.do("truth")["ra_deg"] == pytest.approx(83.8)

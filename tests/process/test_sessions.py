@@ -19,6 +19,10 @@ from tests.protocol.export.dissection import dissect
 pytestmark = pytest.mark.process
 
 
+QUICK = "quick.toml"
+"""Profile without images, which these sessions do not look at."""
+
+
 def starhil(*words: object) -> subprocess.CompletedProcess[str]:
     """Run `starhil` in this process; what it starts are processes."""
     status, out, errors = run_command_line(*map(str, words))
@@ -31,12 +35,14 @@ def starhil(*words: object) -> subprocess.CompletedProcess[str]:
         ("first_light", ["--serial", "auto"]),
         ("slew_tracking", ["--can", "auto"]),
         ("image_download", ["--serial", "auto"]),
-        ("parameters", ["--serial", "auto"]),
-        ("errors", ["--serial", "auto", "--can", "auto"]),
+        ("parameters", ["--serial", "auto", "--profile", QUICK]),
+        ("errors", ["--serial", "auto", "--can", "auto", "--profile", QUICK]),
     ],
     ids=lambda value: value if isinstance(value, str) else "-".join(word[2:] for word in value[::2]),
 )
-def test_a_session_passes(name, links, tmp_path):
+def test_a_session_passes(name, links, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path(QUICK).write_text('extends = "cubestar"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n')
     junit = tmp_path / "junit.xml"
     done = starhil("session", name, "--start", *links, "--log", tmp_path, "--junit", junit, "--json")
     assert done.stderr == ""
@@ -82,7 +88,7 @@ def test_a_session_of_which_no_step_runs_fails(emulator, tmp_path):
 FAULTS = """
 [emulator]
 profile = "ideal"
-set = ["parameters.start_mode=lost_in_space"]
+set = ["parameters.start_mode=lost_in_space", "run.worker=error_model", "camera.distortion=[]"]
 
 [[step]]
 read = "precise_attitude"

@@ -85,6 +85,23 @@ async def talk_over_a_bad_wire(emulation):
     await client.close()
 
 
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    return tmp_path_factory.mktemp("original") / "recorded"
+
+
+@pytest.fixture
+def recorded(record, original, tmp_path):
+    """A copy of a short recording, which is made once."""
+
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    if not original.exists():
+        shutil.copytree(record(scenario), original)
+    return shutil.copytree(original, tmp_path / "recorded", dirs_exist_ok=True)
+
+
 @pytest.mark.parametrize("clock", ["real", "scaled:3", "stepped"])
 def test_a_run_is_repeated_to_the_byte(record, clock, tmp_path):
     async def scenario(emulation, _line):
@@ -480,61 +497,45 @@ def test_traffic_is_reported_while_it_is_recorded(record):
     assert {item.outgoing for item in passed} == {True, False}
 
 
-def test_a_changed_device_is_found(record):
-    async def scenario(emulation, _line):
-        await talk(emulation, 3)
-
-    folder = record(scenario)
-    run_file = folder / RUN_FILE
+def test_a_changed_device_is_found(recorded):
+    run_file = recorded / RUN_FILE
     run = json.loads(run_file.read_text())
     run["profile"]["device"]["firmware_minor"] = 9
     run_file.write_text(json.dumps(run))
-    (difference,) = report_of(folder).differences
+    (difference,) = report_of(recorded).differences
     assert re.fullmatch(r"serial: at \d+\.\d{3} s, identification, byte 3: recorded 00, now 09", difference)
 
 
 @pytest.mark.parametrize("rest", [0, 8])
-def test_a_truncated_recording_is_played_to_its_end_and_called_truncated(record, rest):
+def test_a_truncated_recording_is_played_to_its_end_and_called_truncated(recorded, rest):
     """Cut after an entry that is followed by output, or within the next line."""
 
-    async def scenario(emulation, _line):
-        await talk(emulation, 3)
-
-    folder = record(scenario)
-    events = folder / EVENTS_FILE
+    events = recorded / EVENTS_FILE
     text = events.read_text()
     cut = text.index("\n", len(text) // 2)
     while '"do": "in"' not in text[:cut].rpartition("\n")[2]:
         cut = text.index("\n", cut + 1)
     events.write_text(text[: cut + 1 + rest])
-    report = report_of(folder)
+    report = report_of(recorded)
     assert 0 < report.entries < text.count("\n")
     (difference,) = report.differences
     assert difference.startswith(f"{events}: truncated at ")
 
 
-def test_a_recording_that_goes_on_after_its_end_is_damaged(record):
+def test_a_recording_that_goes_on_after_its_end_is_damaged(recorded):
     """It was called identical, and only the entries before its end were counted."""
 
-    async def scenario(emulation, _line):
-        await talk(emulation, 3)
-
-    folder = record(scenario)
-    lines = (folder / EVENTS_FILE).read_text().splitlines(keepends=True)
+    lines = (recorded / EVENTS_FILE).read_text().splitlines(keepends=True)
     after = next(number for number, line in enumerate(lines) if number > 3 and '"do": "in"' in line)
     end = json.dumps({"ns": json.loads(lines[after - 1])["ns"], "do": "end"})
-    (folder / EVENTS_FILE).write_text("".join([*lines[:after], end, "\n", *lines[after:]]))
+    (recorded / EVENTS_FILE).write_text("".join([*lines[:after], end, "\n", *lines[after:]]))
     with pytest.raises(EmulatorError, match=rf"line {after + 2}: comes after the entry `end`"):
-        report_of(folder)
+        report_of(recorded)
 
 
-def test_a_missing_truth_log_is_a_difference(record):
-    async def scenario(emulation, _line):
-        await talk(emulation, 3)
-
-    folder = record(scenario)
-    (folder / "truth.csv").unlink()
-    assert report_of(folder).differences == [f"{folder / 'truth.csv'}: missing"]
+def test_a_missing_truth_log_is_a_difference(recorded):
+    (recorded / "truth.csv").unlink()
+    assert report_of(recorded).differences == [f"{recorded / 'truth.csv'}: missing"]
 
 
 def changed_cell(folder, column, change):
@@ -564,19 +565,15 @@ def changed_cell(folder, column, change):
     ],
 )
 def test_a_truth_log_is_compared_to_its_resolution_and_a_difference_names_the_machine(
-    record, column, change, is_named
+    recorded, column, change, is_named
 ):
-    async def scenario(emulation, _line):
-        await talk(emulation, 3)
-
-    folder = record(scenario)
-    run = json.loads((folder / RUN_FILE).read_text())
+    run = json.loads((recorded / RUN_FILE).read_text())
     assert set(run["machine"]) == {"processor", "python", "numpy", "numba", "libc"}
     run["machine"]["libc"] = "musl 9"
-    (folder / RUN_FILE).write_text(json.dumps(run))
-    assert report_of(folder).differences == []
-    changed_cell(folder, column, change)
-    differences = report_of(folder).differences
+    (recorded / RUN_FILE).write_text(json.dumps(run))
+    assert report_of(recorded).differences == []
+    changed_cell(recorded, column, change)
+    differences = report_of(recorded).differences
     if is_named:
         difference, machine = differences
         assert re.match(rf"truth log: row \d+ differs in {column}: recorded ", difference)
@@ -600,24 +597,17 @@ def test_a_machine_without_a_description_of_its_processor_is_named_by_its_archit
         ("parameters.update_rate=0.5", "the device behaves differently"),
     ],
 )
-def test_another_profile_is_compared_with_the_recording(record, tmp_path, override, message):
-    async def scenario(emulation, _line):
-        await talk(emulation, 3)
-
-    folder = record(scenario)
+def test_another_profile_is_compared_with_the_recording(recorded, tmp_path, override, message):
     mine = tmp_path / "mine.toml"
     mine.write_text('[parameters]\nstart_mode = "lost_in_space"\nupdate_rate = 5.0\n')
-    status, out, err = run_command_line("replay", str(folder), "--profile", str(mine), "--set", override)
+    status, out, err = run_command_line("replay", str(recorded), "--profile", str(mine), "--set", override)
     assert (status, err) == (0 if message == "identical" else 1, "")
     assert message in out
 
 
-def test_a_key_of_the_recorded_profile_is_changed_and_the_fields_that_differ_are_listed(record, tmp_path):
-    async def scenario(emulation, _line):
-        await talk(emulation, 3)
-
-    folder, table = record(scenario), tmp_path / "new" / "differences.csv"
-    words = ["replay", str(folder), "--set", "device.firmware_minor=9", "--csv", str(table)]
+def test_a_key_of_the_recorded_profile_is_changed_and_the_fields_that_differ_are_listed(recorded, tmp_path):
+    table = tmp_path / "new" / "differences.csv"
+    words = ["replay", str(recorded), "--set", "device.firmware_minor=9", "--csv", str(table)]
     status, out, err = run_command_line(*words)
     assert (status, err) == (1, "")
     assert "identification, byte 3: recorded 00, now 09" in out
@@ -632,13 +622,9 @@ def test_a_key_of_the_recorded_profile_is_changed_and_the_fields_that_differ_are
     assert (status, err, table.read_text().count("\n")) == (0, "", 1)
 
 
-def test_another_truth_shows_in_the_fields_of_the_attitude_alone(record):
-    async def scenario(emulation, _line):
-        await talk(emulation, 3)
-
-    folder = record(scenario)
+def test_another_truth_shows_in_the_fields_of_the_attitude_alone(recorded):
     report = asyncio.run(
-        replay(folder, settings=["truth={kind='fixed', attitude={ra_deg=10.0, dec_deg=0.0}}"])
+        replay(recorded, settings=["truth={kind='fixed', attitude={ra_deg=10.0, dec_deg=0.0}}"])
     )
     fields = {(item.row, item.field): item for item in report.fields}
     assert {row for row, _ in fields} == {"precise_attitude"}
@@ -721,23 +707,6 @@ IMPOSSIBLE_LINES = {
     "the end of no write": '{"ns": 0, "do": "stored"}',
 }
 """Entries that cannot happen to the device."""
-
-
-@pytest.fixture(scope="module")
-def original(tmp_path_factory):
-    return tmp_path_factory.mktemp("original") / "recorded"
-
-
-@pytest.fixture
-def recorded(record, original, tmp_path):
-    """A copy of a short recording, which is made once."""
-
-    async def scenario(emulation, _line):
-        await talk(emulation, 2)
-
-    if not original.exists():
-        shutil.copytree(record(scenario), original)
-    return shutil.copytree(original, tmp_path / "recorded", dirs_exist_ok=True)
 
 
 def with_line(recorded, line):
