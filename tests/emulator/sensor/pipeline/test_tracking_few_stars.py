@@ -35,15 +35,22 @@ def error_arcsec(result: FrameResult, truth: Attitude) -> float:
     return max(off.cross_boresight_arcsec, off.roll_arcsec)
 
 
+_hidden: dict[tuple[int, bytes], object] = {}
+"""Images by the number and the attitude of their requests; the devices compared here differ behind the detector."""
+
+
 @pytest.fixture
 def three_quarters_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hide three quarters of each image by a dark body."""
     expose = Pipeline._expose
 
     def hidden(self: Pipeline, request: FrameRequest):
-        exposure = expose(self, request)
-        dark = block_side(exposure.image, 0.75, np.random.default_rng((9, request.index)))
-        return replace(exposure, image=dark)
+        taken = request.index, request.truth.attitude.quaternion_xyzw.tobytes()
+        if taken not in _hidden:
+            exposure = expose(self, request)
+            dark = block_side(exposure.image, 0.75, np.random.default_rng((9, request.index)))
+            _hidden[taken] = replace(exposure, image=dark)
+        return _hidden[taken]
 
     monkeypatch.setattr(Pipeline, "_expose", hidden)
 
