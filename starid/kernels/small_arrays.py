@@ -24,9 +24,9 @@ def copy_values(source: Array | Array32, target: Array | Array32) -> None:
 
 
 @inner
-def lower_median(values: Array, count: int) -> float:
-    """Lower median of the first `count` values, which are reordered in place (quickselect)."""
-    low, high, middle = 0, count - 1, (count - 1) // 2
+def nth_smallest(values: Array, count: int, n: int) -> float:
+    """The value that is preceded by n others in order, of the first `count`, which are reordered in place (quickselect)."""
+    low, high = 0, count - 1
     while low < high:
         pivot = values[(low + high) // 2]
         i, j = low, high
@@ -39,13 +39,19 @@ def lower_median(values: Array, count: int) -> float:
                 values[i], values[j] = values[j], values[i]
                 i += 1
                 j -= 1
-        if middle <= j:
+        if n <= j:
             high = j
-        elif middle >= i:
+        elif n >= i:
             low = i
         else:
             break
-    return float(values[middle])
+    return float(values[n])
+
+
+@inner
+def lower_median(values: Array, count: int) -> float:
+    """Lower median of the first `count` values, which are reordered in place."""
+    return nth_smallest(values, count, (count - 1) // 2)
 
 
 @inner

@@ -21,6 +21,7 @@ from starid.identification.thesis.features import FEATURE_COUNT
 from starid.identification.thesis.frame_grid import GridArrays, cell_centre
 from starid.identification.thesis.frame_sky import SkyArrays, cell_features
 from starid.kernels.jit import compiled, inner_checked
+from starid.kernels.small_arrays import nth_smallest
 
 MAX_DEPTH: Final = 22
 """Largest number of levels of the tree: four million buckets."""
@@ -191,16 +192,21 @@ def _push_children(
 
 
 @inner_checked
-def _keep_nearest(distances: Array, cells: Indices, count: int, size: int) -> int:
+def _keep_nearest(distances: Array, cells: Indices, count: int, size: int, work: Array) -> int:
     """Move the nearest `size` of the first `count` to the front, in no particular order; return how many there are."""
     if count <= size:
         return count
-    limit = np.partition(distances[:count], size - 1)[size - 1]
-    nearer = 0
     for i in range(count):
-        nearer += distances[i] < limit
-    tied = np.sort(cells[:count][distances[:count] == limit])
-    last = tied[size - nearer - 1]
+        work[i] = distances[i]
+    limit = nth_smallest(work, count, size - 1)
+    nearer = tied = 0
+    for i in range(count):
+        if distances[i] < limit:
+            nearer += 1
+        elif distances[i] == limit:
+            work[tied] = cells[i]
+            tied += 1
+    last = nth_smallest(work, tied, size - nearer - 1)
     kept = 0
     for i in range(count):
         if distances[i] < limit or (distances[i] == limit and cells[i] <= last):
@@ -229,6 +235,7 @@ def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: I
     room = size + max(size, _LEAST_ROOM)
     near = np.empty(room)
     near_cells = np.empty(room, dtype=np.int64)
+    work = np.empty(room)
     count = 0
     limit = math.inf
     stack = np.zeros((_STACK, 3))
@@ -256,9 +263,9 @@ def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: I
             near_cells[count] = index.cells[i]
             count += 1
             if count == room:
-                count = _keep_nearest(near, near_cells, count, size)
+                count = _keep_nearest(near, near_cells, count, size, work)
                 limit = near[:count].max()
-    count = _keep_nearest(near, near_cells, count, size)
+    count = _keep_nearest(near, near_cells, count, size, work)
     for i in range(size):
         distances[i] = near[i] if i < count else math.inf
         cells[i] = near_cells[i] if i < count else -1
@@ -320,12 +327,13 @@ def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, outc
                 gap = abs(index.codes[i, f] - query[f]) - _HALF_STEP
                 if gap > 0.0:
                     d += gap * gap
-            if d <= best and index.cells[i] != cells[0]:
+            cell = int(np.int64(index.cells[i]))
+            if d <= best and cell != cells[0]:
                 computed += 1
-                exact = _exact_distance(arrays, index.cells[i], observation, sums, vector)
-                if exact < best or (exact == best and index.cells[i] < best_cell):
+                exact = _exact_distance(arrays, cell, observation, sums, vector)
+                if exact < best or (exact == best and cell < best_cell):
                     best = exact
-                    best_cell = int(index.cells[i])
+                    best_cell = cell
     outcome[0] = math.sqrt(best) / 2.55
     outcome[1] = computed
     return best_cell

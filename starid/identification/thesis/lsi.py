@@ -17,7 +17,6 @@ from starid.arithmetic.matrices import product
 from starid.identification.options import Solver
 from starid.identification.thesis.cell_search import (
     CellArrays,
-    CellIndex,
     cell_arrays,
     exact_nearest,
     exact_vector,
@@ -77,8 +76,6 @@ class LsiWork(NamedTuple):
         Right ascensions and declinations, degrees, and polar angles, radians, of these cells, (3, 9).
     weights, results
         Weights and results of the two estimates, (2, 9) and (2, 16).
-    found
-        Distance of the nearest cell, and number of cells compared, (2,).
     """
 
     cells: Indices
@@ -86,7 +83,6 @@ class LsiWork(NamedTuple):
     places: Array
     weights: Array
     results: Array
-    found: Array
 
 
 def lsi_work() -> LsiWork:
@@ -98,7 +94,6 @@ def lsi_work() -> LsiWork:
         np.empty((3, nine)),
         np.empty((2, nine)),
         np.empty((2, _RESULT_SIZE)),
-        np.empty(2),
     )
 
 
@@ -319,24 +314,6 @@ def estimate_from_cell(
     estimate_from_path(searched, cell, observation, lambdas, path, chosen, work)
 
 
-@compiled
-def lsi_kernel(
-    index: CellIndex, searched: SearchedCells, observation: Array, lambdas: Array, work: LsiWork
-) -> int:
-    """Search and estimate; return the nearest cell, −1 if there is none."""
-    if searched.exact:
-        cell = exact_nearest(index, searched.arrays, observation, work.found)
-    else:
-        distances = np.empty(1)
-        nearest = np.empty(1, dtype=np.int64)
-        stored_neighbours(index, observation * 2.55, distances, nearest)
-        cell = nearest[0]
-        work.found[0] = math.sqrt(distances[0]) / 2.55
-    if cell >= 0:
-        estimate_from_cell(searched, cell, observation, lambdas, work)
-    return cell
-
-
 @inner_checked
 def _angle_gap(code: float, other: float, slack: float) -> float:
     """Circular difference of two polar angles in code steps (255 per turn), minus a slack."""
@@ -479,12 +456,7 @@ class LostInSpace:
         DatabaseError
             The observation is not five finite numbers.
         """
-        if self._weights is not None:
-            return self.estimate(observation, *self.nearest(observation))
-        self._check(observation)
-        work = lsi_work()
-        nearest = lsi_kernel(self.index, self.searched, observation, LAMBDAS, work)
-        return _solution(observation, nearest, float(work.found[0]), work)
+        return self.estimate(observation, *self.nearest(observation))
 
     def nearest(self, observation: Array, *, theta_rad: float = math.nan) -> tuple[int, float]:
         """Find the nearest cell of the whole database, and its distance, for a normalised observation.
