@@ -59,7 +59,7 @@ class CaseOptions:
         bool | None,
         typer.Option(
             "--intrusive/--safe-only",
-            help="Also run cases that change modes, parameters and files of the device, or only those that change nothing.",
+            help="Also run cases that change modes and parameters of the device and erase its files, or only those that change nothing.",
             show_default="--safe-only; with --start, --intrusive",
         ),
     ] = None

@@ -101,7 +101,7 @@ def run_session(request: SessionRequest) -> SessionResult:
     console.print(Text(escape_controls(script.title), style="bold"))
     unconfirmed = not request.start and request.control is None and request.truth is None
     if unconfirmed and _asks_for_an_emulator(script):
-        hint = "This session expects the emulator that --start starts (--control ADDRESS checks it). To start it by hand: "
+        hint = "This session was written for the emulator that --start starts; another unit may fail steps. Started by hand: "
         hint += start_command(script, folder)
         console.print(Text(escape_controls(hint), style="yellow"), soft_wrap=True)
     show: Callable[[StepResult], None] = partial(_print_result, console)
