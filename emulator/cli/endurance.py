@@ -147,13 +147,10 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
                 return
             ended, running = wait(running, return_when=FIRST_COMPLETED)
             done += len(ended)
-            show(
-                *(
-                    (done, plan.lives)
-                    if limit_s is None
-                    else (min(time.monotonic() - begin, limit_s), limit_s)
-                )
-            )
+            if limit_s is None:
+                show(done, plan.lives)
+            else:
+                show(min(time.monotonic() - begin, limit_s), limit_s)
             for future in ended:
                 yield future.result()
 

@@ -32,14 +32,16 @@ def main() -> None:
 def call_first_kernel() -> None:
     """Call a kernel while SciPy's linear algebra cannot be imported, for which numba looks once, but which no kernel calls.
 
-    It would take 15 MB and a tenth of the start of the worker.
+    It would take 15 MB and a tenth of the start of the worker. To be called before any kernel, while the process has one thread.
     """
     gc.disable()
     from starid.camera import Camera
 
     sys.modules["scipy.linalg"] = None  # type: ignore[assignment]
-    Camera.from_fov().back_project([[0.0, 0.0]])
-    del sys.modules["scipy.linalg"]
+    try:
+        Camera.from_fov().back_project([[0.0, 0.0]])
+    finally:
+        del sys.modules["scipy.linalg"]
 
 
 def serve_in_thread(link: socket.socket) -> None:
