@@ -13,7 +13,7 @@ from starhil.protocol.unit import load_unit
 
 GCC = shutil.which("gcc")
 PAGE = Path(__file__).parents[3] / "docs" / "c-export.md"
-STATED = re.compile(r"deepest call of any bundled unit takes (\d+) bytes at most")
+STATED = re.compile(r"deepest\s+call\s+of\s+any\s+bundled\s+unit\s+takes\s+(\d+)\s+bytes\s+at\s+most")
 FUNCTION = re.compile(r'node: \{ title: "([^"]+)" label: "[^"]*?(\d+) bytes \((\w+)\)')
 CALL = re.compile(r'edge: \{ sourcename: "([^"]+)" targetname: "([^"]+)"')
 
