@@ -240,10 +240,14 @@ def columns_of_files_and_caches(title: str) -> list[str]:
 
 
 def case_counts(*words: str) -> dict[str, int]:
-    """Return how many cases there are on each link; those that only list values without a rule do not count."""
-    _, listed, _ = run_command_line("conformance", "--list", "--start", *words)
+    """Return how many cases there are on each link, as the command lists and totals them; those without a rule do not count."""
+    _, listed, totals = run_command_line("conformance", "--list", "--start", *words)
     areas = [line.split(".")[:2] for line in listed.splitlines()]
-    return Counter(link for link, area in areas if area != "unjudged")
+    counts = Counter(link for link, area in areas if area != "unjudged")
+    assert totals.startswith(
+        "judged cases: " + ", ".join(f"{number} {link}" for link, number in counts.items())
+    )
+    return counts
 
 
 def test_the_numbers_of_conformance_cases_are_those_that_the_command_lists():

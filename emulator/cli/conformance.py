@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -157,6 +158,7 @@ def command(
     from starhil.hil_tests.conformance import report
     from starhil.hil_tests.conformance.conformance_run import requested_cases, run_conformance
     from starhil.hil_tests.conformance.runner import Outcome, left_out_text
+    from starhil.hil_tests.conformance.unjudged_cases import is_unjudged
     from starhil.hil_tests.reports import NOT_RUN, prepare_report
     from starhil.hil_tests.rig.interruption import interruptible
 
@@ -168,6 +170,10 @@ def command(
         for item in requested:
             kind = "intrusive" if item.intrusive else "safe"
             print(f"{item.id}\t{kind}\t{item.title}\t{item.clause}")
+        judged = Counter(each.area.partition(".")[0] for each in requested if not is_unjudged(each.area))
+        counts = ", ".join(f"{number} {link}" for link, number in judged.items())
+        listing = len(requested) - judged.total()
+        print(f"judged cases: {counts}; {listing} more list values without a rule", file=sys.stderr)
         if notice:
             print(notice, file=sys.stderr)
         return

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from starhil.hil_tests.conformance.runner import Outcome
+from starhil.hil_tests.conformance.unjudged_cases import is_unjudged
 from starhil.hil_tests.reports import FAILED, NOT_RUN, PASSED, SKIPPED, TestCase, write_junit, write_report
 from starhil.protocol.errors import escape_controls
 
@@ -87,7 +88,7 @@ def print_summary(console: Console, outcomes: Sequence[Outcome]) -> None:
 
 
 def _is_unjudged(outcome: Outcome) -> bool:
-    return outcome.status == SKIPPED and outcome.area.endswith(".unjudged")
+    return outcome.status == SKIPPED and is_unjudged(outcome.area)
 
 
 def write_junit_report(path: Path, outcomes: Sequence[Outcome]) -> None:

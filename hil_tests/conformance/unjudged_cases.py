@@ -19,6 +19,7 @@ from starhil.hil_tests.conformance.link_probe import REPORT_QUANTITIES
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.rows import Field, Row
 
+AREA: Final = "unjudged"
 CLAUSE: Final = "[[telemetry]]: `value` of a field"
 PLUGIN: Final = "plugin"
 NAMED_FIELDS: Final = 3
@@ -34,7 +35,12 @@ def unjudged_cases(unit: Unit, fields: Iterable[tuple[Row, Field]]) -> Iterator[
     for kind, found in groups.items():
         whose = "quantities of the plugin" if kind == PLUGIN else f"quantities {kind}"
         title = f"values of {whose}, of which a derived case knows only the limits"
-        yield case_in("unjudged", kind, title, partial(_listed, kind, found), CLAUSE)
+        yield case_in(AREA, kind, title, partial(_listed, kind, found), CLAUSE)
+
+
+def is_unjudged(area: str) -> bool:
+    """Return whether the cases of an area only list values."""
+    return area.endswith(f".{AREA}")
 
 
 def unjudged_fields(unit: Unit, compared: Iterable[tuple[Row, str]]) -> Iterator[tuple[Row, Field]]:

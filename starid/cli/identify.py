@@ -443,7 +443,7 @@ def _print_solution(report: dict[str, Any], console: Console) -> None:
         f"field {report['fov_deg']:.3f}° wide"
     )
     console.print(
-        f"{len(report['stars'])} of {report['stars_detected']} stars identified, rms {report['rms_px']:.3f} px, "
+        f"{len(report['stars'])} of {report['stars_detected']} stars identified, unweighted rms {report['rms_px']:.3f} px, "
         f"1σ {report['sigma_cross_arcsec']:.2f}″ across and {report['sigma_roll_arcsec']:.1f}″ about the boresight, "
         f"false with probability < {max(report['probability_false'], 1e-300):.1g}"
     )
