@@ -223,12 +223,16 @@ def test_every_link_between_documents_leads_somewhere():
                 assert anchor in anchors, f"{file.name}: {target}"
 
 
-def test_the_pages_can_be_read_in_a_day():
-    words = sum(
-        len(file.read_text(encoding="utf-8").split())
+def test_the_pages_can_be_read_in_a_day_and_on_a_narrow_screen():
+    texts = {
+        file.name: file.read_text(encoding="utf-8")
         for file in [*DOCS.glob("*.md"), DOCS.parent / "README.md"]
-    )
-    assert words <= 50_000
+    }
+    assert sum(len(text.split()) for text in texts.values()) <= 50_000
+    rows = [
+        (name, line) for name, text in texts.items() for line in text.splitlines() if line.startswith("|")
+    ]
+    assert [(name, line) for name, line in rows if len(line) > 300] == []
 
 
 def columns_of_files_and_caches(title: str) -> list[str]:
