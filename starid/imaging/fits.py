@@ -1,0 +1,148 @@
+"""Fits of single and double stars to the candidates of an image."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from starid.arithmetic.arrays import Array, Array32, Indices32, Mask, Records
+from starid.arithmetic.elementary import square
+from starid.imaging.candidates import Candidates
+from starid.imaging.centroid import FIT, GOOD, NO_FIT
+from starid.imaging.measurement import (
+    BAD_FIT,
+    FIRST_ROUNDS,
+    FIT_PARAMETERS,
+    NOT_A_STAR,
+    REFIT_ROUNDS,
+    SATURATED,
+    find_neighbours,
+    measure,
+)
+from starid.imaging.pairs import split_pairs
+
+_MISFITS_FOR_TRAILS: Final = 8
+_MISFIT_SHARE: Final = 0.1
+_MISFIT_SIGMA: Final = 3.0
+_RELAXED_SHARE: Final = 0.8
+_MAX_NEIGHBOURS: Final = 64
+
+
+@dataclass(frozen=True)
+class Fits:
+    """Candidates with their windows and pixels, neighbours, fits and flags.
+
+    `sensor`, `lit` and `size` are arguments of `starid.imaging.measurement.measure`.
+    """
+
+    candidates: Candidates
+    windows: Records
+    pixels: Array32
+    first: Indices32
+    neighbours: Indices32
+    sensor: tuple[float, float, float, float]
+    lit: tuple[float, float, float]
+    size: tuple[int, int]
+    stars: Records
+    flags: npt.NDArray[np.uint8]
+
+    def measure(self, todo: Mask, turns: tuple[int, int]) -> None:
+        """Fit the candidates of a mask (n,) in the given rounds."""
+        measure(
+            self.windows,
+            self.pixels,
+            self.first,
+            self.neighbours,
+            self.sensor,
+            self.lit,
+            self.size,
+            todo,
+            turns,
+            self.stars,
+            self.flags,
+        )
+
+    def explained(self, objects: Array, reach_px: float) -> float:
+        """Sum of ``(flux/σ)²`` of the stars near objects, whose first columns are their positions, less two for each parameter of a fit."""
+        good = self.stars[self.stars["state"] == GOOD]
+        off = np.column_stack([good["x"], good["y"]])[:, None] - objects[None, :, :2]
+        near = np.any(np.sum(square(off), axis=2) <= square(reach_px), axis=1)
+        return float(np.sum(square(good["flux"][near]) / good["var_flux"][near] - 2.0 * FIT_PARAMETERS))
+
+    @property
+    def suspicious(self) -> bool:
+        """Whether many candidates do not have the shape of a star."""
+        good = self.stars[self.stars["state"] == GOOD]
+        misfit = np.count_nonzero(misfits(good)[1]) + np.count_nonzero(self.stars["state"] == NOT_A_STAR)
+        return bool(misfit >= max(_MISFITS_FOR_TRAILS, _MISFIT_SHARE * len(good)))
+
+    def with_companions(self) -> Fits:
+        """Fit bad candidates as pairs and add their companions."""
+        stars = self.stars
+        bad = (stars["state"] == GOOD) & (stars["chi2"] > BAD_FIT * (stars["pixels"] - FIT_PARAMETERS))
+        if not bad.any():
+            return self
+        suspects = np.flatnonzero(bad & ((self.flags & SATURATED) == 0))
+        partners, owners = np.empty(len(suspects), FIT), np.empty(len(suspects), dtype=np.int64)
+        near = (self.first, self.neighbours)
+        blend_px = self.candidates.scene.settings.blend_px
+        pair_count = split_pairs(
+            self.windows,
+            self.pixels,
+            *near,
+            self.sensor[:2],
+            stars,
+            suspects,
+            blend_px,
+            partners,
+            owners,
+            bad,
+        )
+        self.measure(bad, REFIT_ROUNDS)
+        owners = owners[:pair_count]
+        return dataclasses.replace(
+            self,
+            windows=np.concatenate([self.windows, self.windows[owners]]),
+            stars=np.concatenate([stars, partners[:pair_count]]),
+            flags=np.concatenate([self.flags, self.flags[owners]]),
+        )
+
+
+def fit_candidates(candidates: Candidates) -> Fits:
+    """Fit the highest candidates, each as a single star."""
+    scene = candidates.scene
+    settings = scene.settings
+    windows, pixels = candidates.cut(2 * settings.max_stars)
+    count = len(windows)
+    first = np.empty(count + 1, dtype=np.int32)
+    neighbours = np.empty(_MAX_NEIGHBOURS * count, dtype=np.int32)
+    find_neighbours(windows, np.argsort(windows["start_y"], kind="stable"), first, neighbours)
+    per_dn = 0.0 if settings.gain_e_per_dn is None else 1.0 / settings.gain_e_per_dn
+    ratio = _RELAXED_SHARE * settings.threshold_sigma
+    stars = np.zeros(count, FIT)
+    stars["state"] = NO_FIT
+    fits = Fits(
+        candidates,
+        windows,
+        pixels,
+        first,
+        neighbours,
+        (per_dn, settings.model_error, ratio, scene.saturation - scene.background.median_level),
+        (settings.pixel_sigma, float(settings.min_star_pixels), float(settings.max_star_pixels)),
+        scene.size,
+        stars,
+        np.zeros(count, dtype=np.uint8),
+    )
+    fits.measure(np.ones(count, dtype=bool), FIRST_ROUNDS)
+    return fits
+
+
+def misfits(fits: Records) -> tuple[Array, Mask]:
+    """Reduced χ² (n,) of the fits, and which of them do not have the shape of a star."""
+    freedom = np.maximum(fits["pixels"] - FIT_PARAMETERS, 1.0)
+    misfit = fits["chi2"] / freedom
+    return misfit, misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom)
