@@ -77,7 +77,7 @@ def warm(
         targets += [(DEFAULT_PROFILE, name) for name in bundled_units()]
     fixed = [
         "run.clock=stepped",
-        "run.worker=process",
+        "run.worker=thread",
         "links.serial.port=off",
         "links.can.channel=off",
         "links.canopen.node=0",

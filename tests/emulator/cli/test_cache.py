@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -13,23 +13,43 @@ from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
 from starhil.emulator.profile import load_profile
+from starhil.emulator.sensor.pipeline.messages import (
+    Failure,
+    IndexReady,
+    IndexRequest,
+    PipelineReady,
+    PipelineSetup,
+)
+from starhil.protocol.files.bundled import bundled, bundled_units
 from starid.storage import cache
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import CAMERA
-from tests.emulator.workers import WORKER
 
 MEGABYTE = np.zeros(125_000)
-RECORDS_SETUP = (
-    WORKER.replace("{", "{{").replace("}", "}}")
-    + "text = f'{{setup.previews}} {{setup.sky}}'\nopen('{path}', 'w').write(text)\nsend({outcome})\n"
-)
-RECORDS_INDEX = """
-from starhil.emulator.sensor.pipeline.messages import IndexReady
-settings = receive().settings
-open({path!r}, "w").write(f"{{settings.limiting_magnitude}} {{settings.focal_length}} {{settings.centroid_x}}")
-send(IndexReady())
-receive()
-"""
+
+
+@dataclass
+class StandIn:
+    """A pipeline that does nothing, and what was asked of it; or the failure with which it does not start."""
+
+    failure: Failure | None = None
+    setups: list[PipelineSetup] = field(default_factory=list)
+    requests: list[IndexRequest] = field(default_factory=list)
+
+    def make(self, setup: PipelineSetup) -> tuple[StandIn, PipelineReady] | Failure:
+        self.setups.append(setup)
+        return self.failure or (self, PipelineReady(CAMERA, 5, 0.0))
+
+    def handle(self, request: IndexRequest) -> IndexReady:
+        self.requests.append(request)
+        return IndexReady()
+
+
+@pytest.fixture
+def pipeline(monkeypatch: pytest.MonkeyPatch) -> StandIn:
+    stand_in = StandIn()
+    monkeypatch.setattr("starhil.emulator.sensor.pipeline.pipeline.make_pipeline", stand_in.make)
+    return stand_in
 
 
 @pytest.fixture
@@ -122,31 +142,42 @@ def test_kernels_are_counted_from_a_time_on(folder: Path) -> None:
 
 
 def test_warming_the_cache_starts_a_pipeline_that_needs_every_kernel_and_the_index_of_the_device(
-    folder: Path, worker: Callable[..., object]
+    folder: Path, pipeline: StandIn
 ) -> None:
-    setup, index = folder.parent / "setup", folder.parent / "index"
-    ready = RECORDS_SETUP.format(path=setup, outcome=f"PipelineReady({CAMERA}, 5, 0.0)")
-    worker(ready + RECORDS_INDEX.format(path=str(index)))
     status, out, said = run_command_line("cache", "warm", "cubestar")
     assert (status, said) == (0, "")
     assert out.startswith("0 kernels added to ")
     assert str(folder) in out
-    assert setup.read_text() == f"True {load_profile('cubestar').sky}"
-    assert index.read_text() == "4.2 1247.35 470.32"  # as in the profile
+    ((setup,), (request,)) = pipeline.setups, pipeline.requests
+    assert (setup.previews, setup.sky) == (True, load_profile("cubestar").sky)
+    settings = request.settings
+    assert (settings.limiting_magnitude, settings.focal_length, settings.centroid_x) == (4.2, 1247.35, 470.32)
+
+
+def test_the_cache_is_warmed_for_all_profiles_and_units_in_one_process(
+    folder: Path, pipeline: StandIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process for each of them took five times as long."""
+    started: list[object] = []
+    monkeypatch.setattr("starhil.emulator.sensor.pipeline.worker_process.subprocess.Popen", started.append)
+    assert run_command_line("cache", "warm")[::2] == (0, "")
+    assert started == []
+    count = len(bundled("profile")) + len(bundled_units())
+    assert (len(pipeline.setups), len(pipeline.requests)) == (count, count)
+    assert {setup.algorithm for setup in pipeline.setups} == {"geometric", "rsi"}
 
 
 def test_the_cache_is_warmed_for_a_unit_in_the_working_directory(
-    folder: Path, worker: Callable[..., object], monkeypatch: pytest.MonkeyPatch
+    folder: Path, pipeline: StandIn, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ready = RECORDS_SETUP.format(path=folder.parent / "setup", outcome=f"PipelineReady({CAMERA}, 5, 0.0)")
-    worker(ready + RECORDS_INDEX.format(path=str(folder.parent / "index")))
     monkeypatch.chdir(folder.parent)
     assert run_command_line("unit", "new", "mine")[0] == 0
     assert run_command_line("cache", "warm", "--unit", "mine")[::2] == (0, "")
+    assert len(pipeline.requests) == 1
 
 
-def test_a_failure_to_warm_the_cache_is_one_line(folder: Path, worker: Callable[..., object]) -> None:
-    worker(RECORDS_SETUP.format(path=folder.parent / "setup", outcome="Failure('no catalogue')"))
+def test_a_failure_to_warm_the_cache_is_one_line(folder: Path, pipeline: StandIn) -> None:
+    pipeline.failure = Failure("no catalogue")
     status, out, said = run_command_line("cache", "warm")
     assert (status, out, said.count("\n")) == (2, "", 1)
     assert said.endswith("cubestar.toml: no catalogue\n")
