@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import sys
+from contextlib import suppress
+from pathlib import Path
 
 from starid.errors import StaridError
 from starid.storage.working_folder import check_working_folder
@@ -22,7 +24,7 @@ def main() -> None:
             for number in (signal.SIGTERM, signal.SIGHUP):
                 if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
                     signal.signal(number, _end)
-            if not any("run.worker=" in word for word in sys.argv):
+            if not any(map(_names_worker, sys.argv[2:])):
                 from starhil.emulator.sensor.pipeline.worker_process import start_ahead
 
                 start_ahead()  # the worker takes longest to start, so it is started before the imports of this process
@@ -30,6 +32,15 @@ def main() -> None:
     except KeyboardInterrupt:
         raise SystemExit(130) from None
     run()
+
+
+def _names_worker(word: str) -> bool:
+    """Whether a word of the command line, or the profile that it names, may choose a run without a worker process."""
+    if not word.endswith(".toml"):
+        return "run.worker=" in word
+    with suppress(OSError):
+        return Path(word).is_file() and b"worker" in Path(word).read_bytes()
+    return False  # the profile is read later, with an error that names it
 
 
 def _end(_number: int, _frame: object) -> None:

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -51,10 +52,15 @@ def test_a_signal_before_the_event_loop_ends_a_run_as_a_later_one_does(number):
         (["run", "demo"], "worker False False"),
         (["run", "--help"], "Usage"),
         (["run", "gone", "--set", "run.worker=error_model"], "'gone': not found"),
+        (["run", "quick.toml", "--set", "gone=1"], "gone"),
         ([], "Usage"),
     ],
 )
-def test_only_a_run_with_a_worker_starts_it_before_anything_else_is_imported(arguments, said):
+def test_only_a_run_with_a_worker_starts_it_before_anything_else_is_imported(
+    arguments, said, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    Path("quick.toml").write_text('extends = "ideal"\n[run]\nworker = "error_model"\n')
     ended = python(AHEAD.format(arguments=arguments))
     assert said in ended.stdout + ended.stderr
     assert ("worker" in ended.stdout.split()) == (said.startswith("worker"))
