@@ -127,9 +127,11 @@ def test_the_errors_in_a_tumble_agree_with_the_stated_covariance_and_repeat_to_t
     fmu2: Path, fmu3: Path
 ) -> None:
     inputs = tumble(15.0)
-    outputs, of_version_2 = (simulate(path, inputs) for path in (fmu3, fmu2))
-    assert outputs.tobytes() == of_version_2.tobytes()
+    outputs = simulate(fmu3, inputs, profile=str(fmu3.parent / QUICK))
     check_covariance(outputs, inputs)
+    of_version_2 = simulate(fmu2, inputs[:51], profile=str(fmu2.parent / QUICK))
+    assert of_version_2.tobytes() == outputs[:51].tobytes()
+    assert of_version_2["valid"][-1]
 
 
 def test_long_steps_and_a_late_begin_keep_the_stated_covariance(fmu3: Path) -> None:

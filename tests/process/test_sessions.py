@@ -14,13 +14,23 @@ import pytest
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from tests.candump import read_candump
 from tests.emulator.cli.command_line import log_lines, run_command_line
+from tests.process.conftest import NO_IMAGES_OPTIONS
 from tests.protocol.export.dissection import dissect
 
 pytestmark = pytest.mark.process
 
 
-QUICK = "quick.toml"
-"""Profile without images, which these sessions do not look at."""
+QUICK, QUICK_IDEAL = "quick.toml", "quick_ideal.toml"
+"""Profiles without images, which these sessions do not look at."""
+
+
+@pytest.fixture
+def profiles(tmp_path, monkeypatch):
+    """The profiles without images, in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    for name, base in ((QUICK, "cubestar"), (QUICK_IDEAL, "ideal")):
+        text = f'extends = "{base}"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
+        Path(name).write_text(text)
 
 
 def starhil(*words: object) -> subprocess.CompletedProcess[str]:
@@ -33,16 +43,15 @@ def starhil(*words: object) -> subprocess.CompletedProcess[str]:
     ("name", "links"),
     [
         ("first_light", ["--serial", "auto"]),
-        ("slew_tracking", ["--can", "auto"]),
+        ("slew_tracking", ["--can", "auto", "--profile", QUICK_IDEAL]),
         ("image_download", ["--serial", "auto"]),
         ("parameters", ["--serial", "auto", "--profile", QUICK]),
         ("errors", ["--serial", "auto", "--can", "auto", "--profile", QUICK]),
     ],
     ids=lambda value: value if isinstance(value, str) else "-".join(word[2:] for word in value[::2]),
 )
-def test_a_session_passes(name, links, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    Path(QUICK).write_text('extends = "cubestar"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n')
+@pytest.mark.usefixtures("profiles")
+def test_a_session_passes(name, links, tmp_path):
     junit = tmp_path / "junit.xml"
     done = starhil("session", name, "--start", *links, "--log", tmp_path, "--junit", junit, "--json")
     assert done.stderr == ""
@@ -57,8 +66,12 @@ def test_a_session_passes(name, links, tmp_path, monkeypatch):
         assert [frame for frame in dissect(tmp_path / "can.log") if frame.malformed] == []
 
 
+@pytest.mark.usefixtures("profiles")
 def test_the_procedure_for_lissa_s_star_tracker_passes(tmp_path):
-    words = ("--unit", "st16", "--start", "--serial", "auto", "--log", tmp_path, "--json")
+    words = (
+        *("--unit", "st16", "--start", "--profile", QUICK_IDEAL),
+        *("--serial", "auto", "--log", tmp_path, "--json"),
+    )
     done = starhil("session", "st16_lissa", *words)
     result = json.loads(done.stdout)
     failed = [(item["step"], item["detail"]) for item in result["results"] if item["status"] == "failed"]
@@ -163,7 +176,7 @@ def test_the_commands_for_an_emulator_that_runs_work_as_the_page_has_them(tmp_pa
     page = (Path(__file__).parents[2] / "docs" / "sessions.md").read_text(encoding="utf-8")
     (pair,) = re.findall(r"^    (starhil run .*--control.*)\n    (starhil session .*)$", page, re.MULTILINE)
     run, session = (shlex.split(line.replace("/tmp/", f"{tmp_path}/"))[1:] for line in pair)
-    with EmulatorProcess([installed_command(), *run]):
+    with EmulatorProcess([installed_command(), *run, *NO_IMAGES_OPTIONS]):
         done = starhil(*session, "--log", tmp_path / "log")
         assert done.returncode == 0, done.stdout + done.stderr
         moved = starhil("session", "slew_tracking", *session[2:], "--log", tmp_path / "other")

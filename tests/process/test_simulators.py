@@ -1,4 +1,4 @@
-"""The examples of docs/simulators.md, run unchanged."""
+"""The examples of docs/simulators.md, run unchanged; those of a simulator without images, which show nothing of it."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_com
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.truth.simulators import blocks_of_42
+from tests.process.conftest import NO_IMAGES
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
@@ -75,7 +76,7 @@ def free_port() -> int:
 def test_basilisk_in_lock_step(tmp_path):
     port = str(free_port())
     write_files(tmp_path, "basilisk.toml", port=port)
-    command = emulator_command(profile=str(tmp_path / "basilisk.toml"))
+    command = emulator_command(profile=str(tmp_path / "basilisk.toml"), settings=NO_IMAGES)
     with EmulatorProcess(command) as emulator:
         write_files(tmp_path, "orbit.py", port=port, serial=emulator.ready["serial"])
         figures = printed(start(tmp_path, "orbit.py", "120"))
@@ -90,7 +91,7 @@ def test_basilisk_in_real_time(tmp_path):
     write_files(tmp_path, "basilisk.toml", port=port)
     command = emulator_command(
         profile=str(tmp_path / "basilisk.toml"),
-        settings=["truth.lockstep=false"],
+        settings=["truth.lockstep=false", *NO_IMAGES],
         truth_log=tmp_path / "truth.csv",
         extra=["--clock", "real"],
     )
@@ -131,7 +132,7 @@ def test_42_in_lock_step_and_its_recording(tmp_path):
         server.settimeout(PATIENCE_S)
         command = emulator_command(
             profile="ideal",
-            settings=["truth.kind=42", f"truth.port={server.getsockname()[1]}", "parameters.start_mode=lost_in_space"],
+            settings=["truth.kind=42", f"truth.port={server.getsockname()[1]}", "parameters.start_mode=lost_in_space", *NO_IMAGES],
             truth_log=tmp_path / "truth.csv",
             extra=["--clock", "stepped", "--record", str(tmp_path / "recorded")],
         )  # fmt: skip
