@@ -25,9 +25,17 @@ from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
 
-CAN = ("frames", "segments", "bursts", "errors", "recovery", "unsolicited")
-CANOPEN = ("nmt", "error-control", "sdo", "sdo-block", "sync", "tpdo", "rpdo")
-"""Areas of conformance about IDs, kinds, order and loss of frames; what rows and objects hold is the same on every bus."""
+CASES = {
+    "can.frames": "telemetry other-device standard remote two-at-once askers eight-segmented",
+    "can.segments": "reply swapped two-hosts long",
+    "can.bursts": "block holes one-by-one",
+    "canopen.error-control": "guarding heartbeat consumer",
+    "canopen.sdo-block": "upload-sizes upload-big download download-gap",
+}
+"""Cases of conformance about IDs, remote frames, bursts, order and loss of frames.
+
+What the unit does with frames that have arrived is the same on every bus: the other cases run on the hub.
+"""
 
 SPEED = 0.25
 """Simulation time per second: the guest has one slow processor, and time-outs are rules that stay."""
@@ -131,9 +139,8 @@ def test_candump_and_the_bench_log_the_same_frames(unit, dump, tmp_path):
     assert dump(len(logged)) == logged
 
 
-@pytest.mark.parametrize("name", ["first_light", "errors"])
-def test_a_session_passes_on_the_kernel_bus(name, tmp_path, unit):
-    done = starhil("session", name, "--can", "auto", "--assume-truth", "--log", tmp_path)
+def test_a_session_passes_on_the_kernel_bus(tmp_path, unit):
+    done = starhil("session", "first_light", "--can", "auto", "--assume-truth", "--log", tmp_path)
     assert (done.returncode, done.stderr) == (0, ""), done.stdout
 
 
@@ -167,10 +174,10 @@ def test_the_kernel_sends_periodic_requests_and_each_is_answered(obc):
 
 
 def test_conformance_cases_about_frames_pass_on_the_kernel_bus(unit):
-    areas = [*(f"can.{area}" for area in CAN), *(f"canopen.{area}" for area in CANOPEN)]
-    outcomes = conform(*areas, "--intrusive", "--can", "vcan0", "--canopen", "44", "--speed", str(SPEED))
+    cases = [f"{area}.{name}" for area, names in CASES.items() for name in names.split()]
+    outcomes = conform(*cases, "--intrusive", "--can", "vcan0", "--canopen", "44", "--speed", str(SPEED))
     assert {item["status"] for item in outcomes} == {"passed"}
-    assert {item["id"].rpartition(".")[0] for item in outcomes} == set(areas)
+    assert sorted(item["id"] for item in outcomes) == sorted(cases)
 
 
 @contextlib.contextmanager

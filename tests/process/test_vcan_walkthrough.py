@@ -102,11 +102,13 @@ def dump_of(page: TypedPage, environment: dict[str, str]) -> Iterator[Typed]:
 @pytest.mark.parametrize("name", PAGES)
 def test_what_a_page_types_into_a_shell_is_answered_as_shown(name, shell, emulator):
     page = PAGES[name]
-    with dump_of(page, shell) as dump:
+    keyboard = subprocess.Popen(["sh", "-e"], stdin=subprocess.PIPE, text=True, env=shell)
+    with dump_of(page, shell) as dump, keyboard, keyboard.stdin as line:
         for exchange in page.exchanges:
-            subprocess.run(["sh", "-c", exchange.typed], check=True, env=shell)
+            print(exchange.typed, file=line, flush=True)
             for shown in (exchange.sent, *exchange.answers):
                 frame = dumped(dump.next_line())
                 while shown.id != frame.id in {*UNASKED, HEARTBEAT}:
                     frame = dumped(dump.next_line())
                 assert_shown(frame, shown, exchange.typed)
+    assert keyboard.returncode == 0
