@@ -109,7 +109,7 @@ def _part(source: str, edit: Edit) -> tuple[int, int, str]:
     path = edit.at.partition(":")[2]
     if not path:
         return 0, len(source), ""
-    node: ast.AST = ast.parse(source)
+    node: ast.AST = _parsed(source)
     for part in path.split("."):
         inner = [item for item in ast.iter_child_nodes(node) if getattr(item, "name", None) == part]
         if not inner:
@@ -164,9 +164,14 @@ def _functions(module: types.ModuleType) -> list[types.FunctionType]:
     ]
 
 
+@functools.lru_cache(maxsize=64)
+def _parsed(source: str) -> ast.Module:
+    return ast.parse(source)
+
+
 @functools.cache
 def _compiled(source: str, file: str) -> types.CodeType:
-    return compile(source, file, "exec")
+    return compile(_parsed(source), file, "exec")
 
 
 def _constants(module: types.ModuleType, source: str, old_source: str) -> dict[str, object]:
@@ -197,7 +202,7 @@ def _constants(module: types.ModuleType, source: str, old_source: str) -> dict[s
 def _statements(source: str) -> list[tuple[str, ast.stmt]]:
     """Return the statements of a module, each with its lines, from its decorators on."""
     lines = source.splitlines(keepends=True)
-    statements = ast.parse(source).body
+    statements = _parsed(source).body
     begins = [
         min([each.lineno, *(of.lineno for of in getattr(each, "decorator_list", ()))]) for each in statements
     ]

@@ -63,7 +63,10 @@ def one_line(text: str) -> str:
 
 
 def ascii_line(text: str) -> str:
-    return one_line(text).translate(_ASCII).encode("ascii", errors="replace").decode("ascii")
+    line = one_line(text)
+    if line.isascii():
+        return line
+    return line.translate(_ASCII).encode("ascii", errors="replace").decode("ascii")
 
 
 def eds_text(text: str) -> str:

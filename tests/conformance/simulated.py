@@ -36,8 +36,7 @@ from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import settings_of
 from starhil.hil_tests.judge.canopen import entries
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.canopen.device_dictionary import DeviceDictionary
-from starhil.protocol.canopen.eds import build_eds
+from starhil.protocol.export import eds
 from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.paced import PacedTransport
@@ -207,8 +206,8 @@ class SimulatedUnit:
         unit = read_unit(self.unit)
         if self.kind == "canopen":
             node = int(self.icd.parameters["canopen_node"].default)
-            eds = build_eds(DeviceDictionary(self.icd))
-            self.probe = CanopenProbe(port, node, import_eds(eds, node), eds, entries(unit, unit.canopen))
+            text = eds.render(self.icd)
+            self.probe = CanopenProbe(port, node, import_eds(text, node), text, entries(unit, unit.canopen))
             self.loop.run_until_complete(asyncio.sleep(1.0))
             return self
         if self.kind == "serial":

@@ -101,8 +101,11 @@ def test_every_error_that_changes_a_message_of_the_tutorial_fails_a_case(tmp_pat
     assert caught >= 20
 
 
-@pytest.mark.parametrize("link", LINKS)
-@pytest.mark.parametrize("order", ["big", "little"])
+@pytest.mark.parametrize(
+    ("link", "order"),
+    # little-endian: lengths of two and three bytes, and checks of two and four
+    [*((link, "big") for link in LINKS), *((link, "little") for link in ("sum", "dle", "xor16", "fletcher"))],
+)
 def test_a_unit_on_any_link_passes_every_case(link: str, order: str, tmp_path: Path) -> None:
     folder = write_unit(tmp_path / "unit", link, order)
     with SimulatedUnit("serial", unit=folder) as simulated:

@@ -17,9 +17,9 @@ from starhil.hil_tests.conformance.runner import run_case
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.application import GreyImage
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
-from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import ParameterStorage
+from starhil.protocol.export import eds
 from starhil.protocol.unit import load_unit
 from tests.protocol.canopen.stand_in import StandInApplication
 
@@ -206,8 +206,8 @@ def simulated_probe() -> CanopenProbe:
 
     dictionary.application = RestlessApplication(dictionary.icd)
     slave = CanopenSlave(dictionary, NODE)
-    eds = build_eds(dictionary)
-    return CanopenProbe(SimulatedBus(slave), NODE, import_eds(eds, NODE), eds)
+    text = eds.render(dictionary.icd)
+    return CanopenProbe(SimulatedBus(slave), NODE, import_eds(text, NODE), text)
 
 
 @pytest.fixture(name="simulated_probe", scope="session")
@@ -224,8 +224,8 @@ def read_eds():
 def run_conformance():
     """Run all cases against the node on a bus; return case ids by outcome."""
 
-    def run(bus, eds: str) -> dict[str, set[str]]:
-        probe = CanopenProbe(bus, NODE, import_eds(eds, NODE), eds)
+    def run(bus, text: str) -> dict[str, set[str]]:
+        probe = CanopenProbe(bus, NODE, import_eds(text, NODE), text)
         outcomes: dict[str, set[str]] = {"passed": set(), "failed": set(), "skipped": set()}
         for case in CANOPEN_CASES:
             outcomes[run_case(probe, case).status].add(case.id)

@@ -28,14 +28,10 @@ class StandInApplication:
         self.images: dict[str, GreyImage] = {}
         self.taken: list[str] = []
         self.commands: list[tuple[str, dict[str, Value]]] = []
-        self._reported = {
-            command: [
-                row.name
-                for row in icd.telemetry.values()
-                if any(field.telecommand == command for field in row.named_fields.values())
-            ]
-            for command in icd.telecommands
-        }
+        self._reported: dict[str, list[str]] = {command: [] for command in icd.telecommands}
+        for row in icd.telemetry.values():
+            for command in {field.telecommand for field in row.named_fields.values()} & self._reported.keys():
+                self._reported[command].append(row.name)
 
     def sample(self) -> StandInApplication:
         """Return this application: it is of one moment."""
