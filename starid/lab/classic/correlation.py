@@ -16,6 +16,7 @@ at least three coincident stars besides the aligned one.
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar, Final
 
 import numpy as np
@@ -57,11 +58,15 @@ def correlation(image: Array, count: int, other: Array32, width: float) -> float
             first += 1
         j = first
         while j < other.shape[0] and other[j, 0] <= image[i, 0] + reach:
-            apart = image[i, 0] - other[j, 0]
-            arc = 2.0 * np.sin(0.5 * (image[i, 1] - other[j, 1]))
-            square = apart * apart + image[i, 0] * other[j, 0] * arc * arc
-            if square < reach * reach:
-                total += np.exp(-square / (4.0 * width * width))
+            apart, turn = image[i, 0] - other[j, 0], image[i, 1] - other[j, 1]
+            turns = turn / math.tau
+            least_arc = 4.0 * (turns - math.floor(turns + 0.5))  # an arc is at least 2/π of its angle
+            sides = image[i, 0] * other[j, 0]
+            if apart * apart + sides * least_arc * least_arc < reach * reach:  # few: the others need no sine
+                arc = 2.0 * np.sin(0.5 * turn)
+                square = apart * apart + sides * arc * arc
+                if square < reach * reach:
+                    total += np.exp(-square / (4.0 * width * width))
             j += 1
     return total
 

@@ -68,21 +68,22 @@ def test_peaks_of_smoothed_noise_are_as_many_as_stated(ratio: float) -> None:
     assert peaks == pytest.approx(expected, abs=4.0 * math.sqrt(expected) + 0.1 * expected)
 
 
-@pytest.mark.parametrize("count", [2, 3, 5])
-def test_the_error_with_few_stars_is_as_stated(bright: StarCatalog, count: int) -> None:
-    rng = np.random.default_rng(count)
+def test_the_error_with_few_stars_is_as_stated(bright: StarCatalog) -> None:
     squares = []
-    for _ in range(300):
-        truth = random_attitude(rng)
-        error = np.sqrt(np.diag(PRIOR)) * rng.standard_normal(3)
-        solution = solve(image(truth, bright, count, rng), truth.rotated(error), bright)
-        if solution.valid:
-            off = solution.attitude.error_to(truth)
-            assert max(off.cross_boresight_arcsec, off.roll_arcsec) < 360.0
-            squares.append(
-                off.rotation_vector_rad @ np.linalg.solve(solution.covariance, off.rotation_vector_rad)
-            )
-    assert len(squares) > {2: 60, 3: 270, 5: 290}[count]
+    for count, least in ((2, 20), (3, 90), (5, 96)):
+        rng, before = np.random.default_rng(count), len(squares)
+        for _ in range(100):
+            truth = random_attitude(rng)
+            error = np.sqrt(np.diag(PRIOR)) * rng.standard_normal(3)
+            solution = solve(image(truth, bright, count, rng), truth.rotated(error), bright)
+            if solution.valid:
+                off = solution.attitude.error_to(truth)
+                assert max(off.cross_boresight_arcsec, off.roll_arcsec) < 360.0
+                squares.append(
+                    off.rotation_vector_rad @ np.linalg.solve(solution.covariance, off.rotation_vector_rad)
+                )
+        assert len(squares) - before > least
+    # chi-squared of three degrees of freedom: beyond four standard errors in one of 15 000 samples
     assert np.mean(squares) == pytest.approx(3.0, abs=4.0 * math.sqrt(6.0 / len(squares)))
 
 
@@ -97,7 +98,7 @@ def test_a_wrong_prediction_is_not_confirmed_by_other_stars() -> None:
     """Among 160 stars in the field and four times the errors of the others, pairs fit by chance in a quarter of the images."""
     stars = load_catalog().brighter_than(6.0)
     rng = np.random.default_rng(5)
-    for _ in range(60):
+    for _ in range(25):
         truth = random_attitude(rng)
         found = image(truth, stars, None, rng)
         wrong = truth.rotated(np.radians(rng.uniform(-5.0, 5.0, 3)))
@@ -119,7 +120,7 @@ LIMIT_RAD = math.radians(0.1)
 CONTRADICTION = stats.chi2.ppf(0.999, 3)
 
 
-SAMPLES = 400_000
+SAMPLES = 200_000
 
 
 def simulated_shares(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -65,15 +66,17 @@ def photograph(
     return np.clip(np.rint(counts), 0, top).astype(np.uint8 if top < 256 else np.uint16)
 
 
+@functools.cache
 def scattered(count: int, shape: tuple[int, int], seed: int, gap: float = 14.0) -> np.ndarray:
     """Random positions, no two closer than `gap`, none within 10 pixels of the edge."""
     rng = np.random.default_rng(seed)
-    places: list[np.ndarray] = []
-    while len(places) < count:
-        candidate = rng.uniform((10.0, 10.0), (shape[1] - 11.0, shape[0] - 11.0))
-        if all(np.hypot(*(candidate - other)) > gap for other in places):
-            places.append(candidate)
-    return np.array(places)
+    places, found = np.empty((count, 2)), 0
+    while found < count:
+        places[found] = rng.uniform((10.0, 10.0), (shape[1] - 11.0, shape[0] - 11.0))
+        off = places[:found] - places[found]
+        found += bool(np.all(np.hypot(off[:, 0], off[:, 1]) > gap))
+    places.setflags(write=False)
+    return places
 
 
 def matched(detections: Detections, places: np.ndarray, reach: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
@@ -317,15 +320,15 @@ def few_trails(seed: int, width: float = 1.2) -> tuple[np.ndarray, np.ndarray, n
 def test_trails_of_few_faint_stars_are_followed() -> None:
     """A round spot fits a part of a dim trail, and would be sure of a position several pixels from the middle.
 
-    Of 60 images, 41 showed no trails when six stars or more had to agree on them.
+    Of 30 images, 20 showed no trails when six stars or more had to agree on them.
     """
     followed = 0
-    for seed in range(60):
+    for seed in range(30):
         image, _, path = few_trails(seed)
         trail_px = detect(image, KNOWN).trail_px
         followed += trail_px > 0.0
         assert trail_px == 0.0 or trail_px == pytest.approx(np.linalg.norm(path), rel=0.35)
-    assert followed >= 36
+    assert followed >= 18, followed
 
 
 def test_the_width_of_few_spots_is_measured_among_hot_pixels_beside_a_dark_body() -> None:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import erf
 
 from starid.imaging.detection import DetectionSettings, detect
 from starid.imaging.unmodelled_light import shift_by_hidden_stars
@@ -23,9 +24,7 @@ def shape(u: np.ndarray, v: np.ndarray, length: float, width: float) -> np.ndarr
     if length == 0.0:
         return across * np.exp(-0.5 * (u / width) ** 2) / (math.sqrt(2.0 * math.pi) * width)
     root = math.sqrt(2.0) * width
-    ends = np.vectorize(math.erf)((u + 0.5 * length) / root) - np.vectorize(math.erf)(
-        (u - 0.5 * length) / root
-    )
+    ends = erf((u + 0.5 * length) / root) - erf((u - 0.5 * length) / root)
     return across * ends / (2.0 * length)
 
 

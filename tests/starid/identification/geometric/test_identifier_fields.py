@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import pytest
 
@@ -61,13 +63,17 @@ def test_fields_of_5_to_90_degrees(name: str) -> None:
         assert np.mean(solution.hip == hip[solution.detection_index]) > 0.95
 
 
+@functools.cache
+def of_unknown_focal_length(model: str, fov_deg: float) -> Identifier:
+    return Identifier(Camera.from_fov(fov_deg, 1024, 1024, model=model), fov_tolerance=0.1)
+
+
 @pytest.mark.parametrize("model", ["pinhole", "equidistant"])
 @pytest.mark.parametrize("fov_deg", [11.0, 60.0])
 @pytest.mark.parametrize("factor", [0.93, 1.06])
 def test_an_unknown_focal_length_is_found(model: str, fov_deg: float, factor: float) -> None:
-    nominal = Camera.from_fov(fov_deg, 1024, 1024, model=model)
-    identifier = Identifier(nominal, fov_tolerance=0.1)
-    camera = scaled_camera(nominal, factor)
+    identifier = of_unknown_focal_length(model, fov_deg)
+    camera = scaled_camera(identifier.camera, factor)
     rng = np.random.default_rng(9)
     for i in range(3):
         attitude = random_attitude(rng)
@@ -80,7 +86,7 @@ def test_an_unknown_focal_length_is_found(model: str, fov_deg: float, factor: fl
 
 
 def test_random_points_are_rejected_at_an_unknown_focal_length_too() -> None:
-    identifier = Identifier(Camera.from_fov(25.0, 1024, 1024), fov_tolerance=0.1)
+    identifier = of_unknown_focal_length("pinhole", 25.0)
     rng = np.random.default_rng(10)
     for _ in range(4):
         n = int(rng.integers(20, 100))
@@ -91,7 +97,7 @@ def test_random_points_are_rejected_at_an_unknown_focal_length_too() -> None:
 def test_a_refined_camera_is_used_as_calibrated() -> None:
     nominal = Camera.from_fov(25.0, 1024, 1024)
     camera = scaled_camera(nominal, 1.04)
-    identifier = Identifier(nominal, fov_tolerance=0.1)
+    identifier = of_unknown_focal_length("pinhole", 25.0)
     attitude = Attitude.from_radec_roll(80.0, 10.0, 30.0)
     xy, flux, _ = sky(attitude, camera=camera, limit=6.0, identified=identifier)
     assert not identifier.with_camera(nominal).identify(xy, flux).valid

@@ -76,28 +76,22 @@ def test_lsi_is_right_or_invalid(false_stars):
     assert valid >= 28
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "seed", "images", "least"),
-    [("lsi", 11, 15, 14), ("rsi", 14, 5, 5)],  # of the five, three are not identified in the whole field
-)
-def test_a_half_covered_field_is_identified_by_the_circles_of_a_divided_field(algorithm, seed, images, least):
+@pytest.mark.parametrize("algorithm", ["lsi", "rsi"])
+def test_a_half_covered_field_is_identified_by_the_circles_of_a_divided_field(algorithm):
     identifier = make_identifier(algorithm, divided=True)
-    rng = np.random.default_rng(seed)
-    valid = 0
-    for _ in range(images):
+    rng = np.random.default_rng(14)
+    for _ in range(5):  # of which three are not identified in the whole field
         attitude, side = random_attitude(rng), rng.uniform(0.0, 2.0 * np.pi)
         xy, flux = points(rng, attitude)
         seen = (xy - DEFAULT_CAMERA.centre_px) @ [np.cos(side), np.sin(side)] < 0.0
         solution = identifier.identify(xy[seen], flux[seen])
-        if solution.valid:
-            valid += 1
-            assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
-    assert valid >= least
+        assert solution.valid
+        assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
 
 
 def test_five_missing_stars_of_the_brightest_need_no_divided_field():
     rng = np.random.default_rng(12)
-    valid, images = 0, 60
+    valid, images = 0, 24
     for _ in range(images):
         attitude = random_attitude(rng)
         xy, flux = points(rng, attitude)
@@ -128,6 +122,7 @@ def test_the_scikit_learn_solver_gives_the_same_verified_answers():
 
 
 def test_errors_of_features_alone_are_measured_once_for_what_they_depend_on(tmp_path, monkeypatch):
+    catalog = load_catalog()
     monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(feature_error, "FIELDS", 20)
     of_search, measured = FeatureErrors.of_search, []
@@ -138,7 +133,10 @@ def test_errors_of_features_alone_are_measured_once_for_what_they_depend_on(tmp_
 
     monkeypatch.setattr(FeatureErrors, "of_search", counted)
     first, again, other = (
-        LsiIdentifier(refinement=False, magnitude_sigma=sigma).errors.arrays for sigma in (0.1, 0.1, 0.2)
+        LsiIdentifier(
+            DEFAULT_CAMERA, catalog, refinement=False, overlap=0.7, magnitude_sigma=sigma
+        ).errors.arrays
+        for sigma in (0.1, 0.1, 0.2)
     )
     assert len(measured) == 2
     assert not np.array_equal(first["first_squares"], other["first_squares"])
@@ -146,7 +144,13 @@ def test_errors_of_features_alone_are_measured_once_for_what_they_depend_on(tmp_
         assert {name: values.tobytes() for name, values in arrays.items()} == {
             name: values.tobytes() for name, values in measured[0].arrays.items()
         }
-    LsiIdentifier(refinement=False, parts=Parts(motion=lambda then, now: rotation_between(then, now)))
+    LsiIdentifier(
+        DEFAULT_CAMERA,
+        catalog,
+        refinement=False,
+        overlap=0.7,
+        parts=Parts(motion=lambda then, now: rotation_between(then, now)),
+    )
     assert len(measured) == 3, "other parts have other errors"
 
 
@@ -181,7 +185,7 @@ def test_rsi_follows_a_turning_sensor_among_false_stars():
 def test_errors_of_magnitudes_leave_the_region_useless():
     """Errors of 0.1 mag put stars on the wrong side of the limit of the features, those of 0.03 mag fewer."""
     images_in_region = [
-        [sequence(seed, 15, sigma)[1].in_region for seed in range(30, 35)] for sigma in (0.03, 0.1)
+        [sequence(seed, 8, sigma)[1].in_region for seed in range(30, 35)] for sigma in (0.03, 0.1)
     ]
     # the same five sequences: each has more at 0.03 mag
     assert wilcoxon(*images_in_region, alternative="greater").pvalue < 0.05
@@ -194,13 +198,13 @@ def test_while_the_features_disagree_the_whole_database_is_searched():
     attitude = random_attitude(rng)
     solution = features_only.identify(*points(rng, attitude, magnitude_sigma=0.02))
     exceeded = []
-    for _ in range(40):
+    for _ in range(20):
         exceeded.append(not (solution.valid and solution.features.error_psi <= 0.5))
         attitude = propagate(attitude, np.radians([0.3, 0.4, 0.2]), 1.0)
         solution = features_only.track(*points(rng, attitude, magnitude_sigma=0.02), attitude)
         assert (solution.features.region_deg == 0.0) == exceeded[-1]
         assert not (solution.features.triggered and exceeded[-1])
-    assert 0 < sum(exceeded) < 40
+    assert 0 < sum(exceeded) < 20
 
 
 def test_the_reported_motion_is_that_of_the_boresight_on_the_sphere():
@@ -308,18 +312,18 @@ def test_an_empty_catalogue_is_rejected(options):
         LsiIdentifier(DEFAULT_CAMERA, nothing, **options)
 
 
-CAMERA_DATABASE = DatabaseParameters.for_camera(DEFAULT_CAMERA, overlap=0.9, kappa=5.0)
+CAMERA_DATABASE = DatabaseParameters.for_camera(DEFAULT_CAMERA, overlap=0.5, kappa=5.0)
 
 
 @pytest.mark.parametrize(
     ("parameters", "epoch", "words"),
     [
         (
-            DatabaseParameters.for_camera(Camera.from_fov(30.0), overlap=0.9, kappa=5.0),
+            DatabaseParameters.for_camera(Camera.from_fov(30.0), overlap=0.5, kappa=5.0),
             2026.0,
             "another camera",
         ),
-        (DatabaseParameters(overlap=0.9), 2026.0, "is planar"),
+        (DatabaseParameters(overlap=0.5), 2026.0, "is planar"),
         (dataclasses.replace(CAMERA_DATABASE, direction="faintest"), 2026.0, "circles of the brightest"),
         (dataclasses.replace(CAMERA_DATABASE, band="hp"), 2026.0, "has hp magnitudes"),
         (CAMERA_DATABASE, 1991.25, "another catalogue or epoch"),
@@ -337,20 +341,22 @@ def test_a_database_that_fits_is_used(tmp_path):
 
 
 def test_an_unwritable_folder_only_prevents_caching_the_database(tmp_path, monkeypatch, caplog):
+    catalog = load_catalog()
     (tmp_path / "file").touch()
     monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path / "file" / "cache"))
-    assert obtain_database(load_catalog(), CAMERA_DATABASE, cache=True).parameters == CAMERA_DATABASE
+    assert obtain_database(catalog, CAMERA_DATABASE, cache=True).parameters == CAMERA_DATABASE
     assert "cannot be written" in caplog.text
 
 
 def test_a_cached_database_that_cannot_be_read_is_built_again(tmp_path, monkeypatch, caplog):
+    catalog = load_catalog()
     monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
-    made = obtain_database(load_catalog(), CAMERA_DATABASE, cache=True)
+    made = obtain_database(catalog, CAMERA_DATABASE, cache=True)
     (file,) = tmp_path.glob("features-*.bin")
     whole = file.read_bytes()
     file.write_bytes(whole[:-1])
     np.testing.assert_array_equal(
-        obtain_database(load_catalog(), CAMERA_DATABASE, cache=True).features, made.features
+        obtain_database(catalog, CAMERA_DATABASE, cache=True).features, made.features
     )
     assert "truncated" in caplog.text
     assert file.read_bytes() == whole
@@ -359,5 +365,5 @@ def test_a_cached_database_that_cannot_be_read_is_built_again(tmp_path, monkeypa
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(Path, "is_file", refuse)
-    assert obtain_database(load_catalog(), CAMERA_DATABASE, cache=True).cells == made.cells
+    assert obtain_database(catalog, CAMERA_DATABASE, cache=True).cells == made.cells
     assert "Permission denied" in caplog.text
