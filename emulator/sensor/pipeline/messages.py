@@ -55,7 +55,17 @@ IMAGE_EDGES: Final = (1024, 512, 256, 128, 64)
 
 
 @dataclass(frozen=True)
-class SolverSettings:
+class _Chosen:
+    """Some of the values that a mapping has by name."""
+
+    @classmethod
+    def of(cls, values: Mapping[str, Any]) -> Self:
+        """Take the fields from a mapping, which may have more."""
+        return cls(**{name: values[name] for name in cls.__dataclass_fields__})
+
+
+@dataclass(frozen=True)
+class SolverSettings(_Chosen):
     """Device parameters used in detection and identification, named as in the interface definition."""
 
     detection_threshold: float
@@ -78,14 +88,9 @@ class SolverSettings:
     p1: float
     p2: float
 
-    @classmethod
-    def of(cls, parameters: Mapping[str, Any]) -> Self:
-        """Take the settings from the values of all parameters."""
-        return cls(**{name: parameters[name] for name in cls.__dataclass_fields__})
-
 
 @dataclass(frozen=True)
-class SolvingOptions:
+class SolvingOptions(_Chosen):
     """Keys of `[device]` in a profile that concern the pipeline."""
 
     dark_frames: int
