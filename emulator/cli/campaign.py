@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import shlex
 import sys
@@ -20,7 +19,7 @@ from starhil.emulator.cli.options import Jobs, OrbitChoice, Seed, Settings, name
 from starhil.emulator.cli.output import compiles
 from starid.camera import DEFAULT_FOV_DEG
 from starid.cli.options import AsJson
-from starid.cli.output import Column, print_table, progress_shown
+from starid.cli.output import Column, print_table, steps_shown
 from starid.storage.child_processes import importing_only_what_is_installed
 
 if TYPE_CHECKING:
@@ -397,9 +396,8 @@ def algorithms(
 
     plan = AlgorithmPlan(profile, frames, seed, tuple(with_orbit(setting, orbit)), checked_part(part))
     scenes = SCENES[:1] if lost_only else tuple(each for each in SCENES if (scene or "") in each.name)
-    total, done = sum(each.images(frames) for each in scenes), itertools.count(1)
-    with progress_shown("campaign") as show:
-        rows = list(run_algorithms(plan, scenes, lambda: show(next(done), total)))
+    with steps_shown("campaign", sum(each.images(frames) for each in scenes)) as step:
+        rows = list(run_algorithms(plan, scenes, step))
     if as_json:
         print(json.dumps(rows))
     else:
@@ -542,7 +540,7 @@ def _warn(plan: EcssPlan) -> None:
 
 def _with_progress(chunks: Iterable[Any], total: int) -> Iterator[Any]:
     """Show on stderr how many chunks are done while iterating over them."""
-    with progress_shown("campaign") as show:
-        for done, chunk in enumerate(chunks, 1):
-            show(done, total)
+    with steps_shown("campaign", total) as step:
+        for chunk in chunks:
+            step()
             yield chunk

@@ -15,7 +15,7 @@ from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import BenchOptions, OrbitChoice, Settings, checked_dialect, with_orbit
 from starhil.protocol.files.bundled import DEFAULT_UNIT
 from starid.cli.options import AsJson
-from starid.cli.output import output_help, progress_shown
+from starid.cli.output import output_help, steps_shown
 
 if TYPE_CHECKING:
     from starhil.hil_tests.conformance.conformance_run import ConformanceRequest
@@ -180,13 +180,11 @@ def command(
     for path in (junit, html):
         if path is not None:
             prepare_report(path)
-    with interruptible(), progress_shown("conformance", None if as_json else console) as show_progress:
-        done = 0
+    with interruptible(), steps_shown("conformance", len(requested), None if as_json else console) as step:
 
         def show(outcome: Outcome) -> None:
-            nonlocal done
-            done += outcome.status != NOT_RUN
-            show_progress(done, len(requested), outcome.id)
+            if outcome.status != NOT_RUN:
+                step(outcome.id)
             report.print_outcome(console, outcome, verbose=verbose)
 
         result = run_conformance(request, show)

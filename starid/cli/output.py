@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import io
+import itertools
 import sys
 import threading
 import time
@@ -196,6 +197,14 @@ def progress_shown(work: str, console: Console | None = None) -> Iterator[ShowPr
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(work, total=None)
         yield lambda done, total, name=work: bar.update(task, completed=done, total=total, description=name)
+
+
+@contextmanager
+def steps_shown(work: str, total: int, console: Console | None = None) -> Iterator[Callable[..., None]]:
+    """Show how many of some steps are done, as `progress_shown` does; gives a function to call after each, with its name if it has one."""
+    done = itertools.count(1)
+    with progress_shown(work, console) as show:
+        yield lambda name=work: show(next(done), total, name)
 
 
 def progress() -> Callable[[str], None]:
