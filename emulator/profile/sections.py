@@ -111,13 +111,14 @@ class DeviceConfig(Strict):
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Number of valid frames from which the body rate is estimated, if the star identifier does not do so."""
     tracking_stars: Literal[0] | Annotated[int, Field(ge=2, le=50)] = 2
-    """Least number of matched stars in tracking; 0: `min_stars_matched`, as lost in space."""
+    """Least number of matched stars in tracking, where few stars near the predicted attitude may be fainter (3 sigmas); 0:
+    `min_stars_matched`, as lost in space."""
     largest_error_deg: Annotated[float, Field(ge=0.001, le=10.0)] = 0.1
     """Largest error across or about the boresight: an attitude is invalid if, by its own uncertainty, a larger one is likelier
     than 1e-4."""
     wrong_predictions: Annotated[float, Field(ge=0.0, le=1.0)] = 0.001
-    """Share of the predicted attitudes that are assumed to be wrong, because the body accelerates. The larger it is, the more
-    stars an attitude in tracking needs."""
+    """Share of the predicted attitudes that are assumed to be wrong by more than their uncertainty, because the body accelerates. The
+    larger it is, the more stars an attitude in tracking needs."""
     tracking_windows: bool = False
     """Whether the unit searches only windows around the predicted stars when it tracks, and the whole image only if that fails."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
