@@ -59,7 +59,9 @@ call_first_kernel()
 from starid.identification.geometric.identifier import Identifier
 Identifier().warm_up()
 assert "scipy.linalg" not in sys.modules
-import scipy.linalg"""
+import scipy.linalg
+call_first_kernel()
+assert sys.modules["scipy.linalg"] is scipy.linalg"""
     subprocess.run([sys.executable, "-c", text], check=True)
 
 

@@ -8,6 +8,7 @@ import pickle
 import signal
 import socket
 import sys
+import threading
 from contextlib import suppress
 from typing import Any, Final
 
@@ -25,16 +26,17 @@ def main() -> None:
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the emulator ends this process by closing the socket
     os.nice(NICE)
-    call_first_kernel()
     serve(socket.socket(fileno=int(sys.argv[1])))
 
 
 def call_first_kernel() -> None:
     """Call a kernel while SciPy's linear algebra cannot be imported, for which numba looks once, but which no kernel calls.
 
-    It would take 15 MB and a tenth of the start of the worker. To be called before any kernel, while the process has one thread.
+    It would take 15 MB and a tenth of the start of the worker. Nothing is done if it has been imported, as by an earlier kernel, or
+    could be by another thread.
     """
-    gc.disable()
+    if "scipy.linalg" in sys.modules or threading.active_count() > 1:
+        return
     from starid.camera import Camera
 
     sys.modules["scipy.linalg"] = None  # type: ignore[assignment]
@@ -56,6 +58,7 @@ def serve_in_thread(link: socket.socket) -> None:
 def serve(link: socket.socket) -> None:
     """Receive the setup, then requests, until the emulator closes the socket."""
     gc.disable()  # until the pipeline is warm: imports make many objects and little garbage
+    call_first_kernel()
     from starhil.emulator.sensor.pipeline.pipeline import make_pipeline  # imported while the emulator starts
 
     setup = _receive(link)
