@@ -101,8 +101,8 @@ def run_session(request: SessionRequest) -> SessionResult:
     console.print(Text(escape_controls(script.title), style="bold"))
     unconfirmed = not request.start and request.control is None and request.truth is None
     if unconfirmed and _asks_for_an_emulator(script):
-        hint = "This session was written for the emulator that --start starts; another unit may fail steps. Started by hand: "
-        hint += start_command(script, folder)
+        remedy = f"use --start; or {_control_option(script, folder)}"
+        hint = f"This session was written for an emulator; another unit may fail steps: {remedy}"
         console.print(Text(escape_controls(hint), style="yellow"), soft_wrap=True)
     show: Callable[[StepResult], None] = partial(_print_result, console)
     result: SessionResult | None = None
@@ -156,6 +156,12 @@ def start_command(script: Script, folder: Path) -> str:
     return shlex.join([*words, "--control", "auto"])
 
 
+def _control_option(script: Script, folder: Path) -> str:
+    """Return how to name an emulator that runs, so that it is compared with what a script needs."""
+    start = start_command(script, folder)
+    return f"--control with the address on the ready line, for an emulator that runs by: {start}"
+
+
 def _check_emulator(path: Path, script: Script, rig: Rig, folder: Path) -> None:
     """Raise BenchError if the emulator that runs is not the one that a script is for: profile, settings, where it looks."""
     status, emulator = rig.control("status", {}), script.emulator
@@ -192,18 +198,17 @@ def _check_steps(
     controlled = request.start or request.control is not None
     if request.truth is None and not controlled:
         folder = request.folder or DEFAULT_FOLDER / path.stem
-        start = start_command(script, folder)
+        control = _control_option(script, folder)
         if script.truth.file is not None:
             log = shlex.quote(str(folder / script.truth.file))
             raise ScriptError(
                 f"{path.name}: compares attitudes with a truth that the emulator writes: use --start; or give --truth {log}, or "
-                f"--control with the address on the ready line, for an emulator that runs by: {start}"
+                f"{control}"
             )
         if _compares_with_its_attitude(script) and not request.assume_truth:
             raise ScriptError(
                 f"{path.name}: compares attitudes with its [truth], and nothing shows that the unit looks there: use --start; or give "
-                "--assume-truth if it does; or --control with the address on the ready line, for an emulator that runs by: "
-                f"{start}"
+                f"--assume-truth if it does; or {control}"
             )
     for number, step, link in script.planned(links):
         why = ""
