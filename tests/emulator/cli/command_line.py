@@ -35,8 +35,8 @@ def run_command_line(
 
 
 def log_lines(errors: str) -> list[str]:
-    """Lines on stderr, but for the progress of a slow start."""
-    return [line for line in errors.splitlines() if not line.startswith("starting:")]
+    """Lines on stderr, but for those of kernels that are not in the cache yet."""
+    return [line for line in errors.splitlines() if not line.startswith(("starting:", "compiling:"))]
 
 
 def _text(stream: io.TextIOWrapper) -> str:

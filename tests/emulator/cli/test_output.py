@@ -22,7 +22,7 @@ from starid.cli import app as library
 from starid.cli import command_line
 from starid.cli.output import progress_shown, show_every_character
 from starid.errors import StaridError
-from tests.emulator.cli.command_line import run_command_line
+from tests.emulator.cli.command_line import log_lines, run_command_line
 from tests.emulator.workers import WORKER
 from tests.waiting import PATIENCE_S
 
@@ -45,8 +45,9 @@ def program_of(command: str) -> str:
 def refusal(*arguments: str) -> str:
     """The one line on standard error of a command that is rejected."""
     status, out, said = run_command_line(*arguments, program=program_of(arguments[0]))
-    assert (status, out, said.count("\n")) == (2, "", 1), said
-    return said
+    assert (status, out, said[-1:]) == (2, "", "\n"), said
+    (line,) = log_lines(said)
+    return line + "\n"
 
 
 def commands(group: Any = None, path: str = "") -> list[tuple[str, Any]]:
@@ -110,7 +111,8 @@ def test_an_image_on_the_standard_output_has_its_report_on_the_standard_error() 
     )
     assert done.stdout.startswith(b"\x89PNG")
     assert done.stdout.endswith(b"IEND\xaeB`\x82")
-    assert json.loads(done.stderr)["width"] == 64
+    (report,) = log_lines(done.stderr.decode())
+    assert json.loads(report)["width"] == 64
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp437", "utf-8"])
