@@ -1,4 +1,7 @@
-"""Fits of single and double stars to the candidates of an image."""
+"""Fits of single and double stars to the candidates of an image.
+
+What is found with other values of a constant: `python tools/vary_constant.py imaging.fits._MISFIT_SIGMA 6`.
+"""
 
 from __future__ import annotations
 
@@ -27,9 +30,19 @@ from starid.imaging.pairs import split_pairs
 
 _MISFITS_FOR_TRAILS: Final = 8
 _MISFIT_SHARE: Final = 0.1
+"""Misfits are many from this number and this share of the stars: of those of the default sensor, at rest, 3 % are misfits.
+With half or twice of either, the same stars are found."""
+
 _MISFIT_SIGMA: Final = 3.0
+"""Excess of χ² over its mean, in standard deviations, from which a fit states wider errors: 0.2 to 1 % of good fits have more.
+With 6, the squared errors of stars at rest are 2.24 times the stated ones instead of 2.06 times."""
+
 _RELAXED_SHARE: Final = 0.8
+"""Signal of a fitted star at least, as a share of the threshold: noise that made a peak higher is not in its fit. With 1, two
+of 9505 stars are lost, with 0.6 one is won, and four more are false."""
+
 _MAX_NEIGHBOURS: Final = 64
+"""Room for the neighbours of a candidate, on average; with 16 or 128 the same stars are found."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""Peaks of an image that is smoothed with the profile of a star, or along trails."""
+"""Peaks of an image that is smoothed with the profile of a star, or along trails.
+
+What is found with other values of a constant: `python tools/vary_constant.py imaging.peaks._MAX_PEAKS 4096`.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,10 @@ from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, tr
 from starid.imaging.windows import MIN_SPREAD_PX, sky_under_lone_pixels
 
 _MAX_PEAKS: Final = 8192
+"""Room for peaks, 100 kB; with half, a fifth of the stars among 5000 hot pixels are lost (947 of 1209), with twice none is won."""
+
 _THRESHOLD_STEP: Final = 1.5
+"""Factor on the threshold while there is no room; with 1.2 or 3 the same stars are found."""
 
 
 class Peaks(NamedTuple):

@@ -5,6 +5,9 @@ hits, glints) are not seen again; stationary ones (hot pixels) stay behind when 
 ones (debris, other satellites) leave the gate. If the motion is so slow that stationary and drifting objects
 stay within the gate, they are recognised by their scatter about their position among the stars. The cost is a
 few operations per pair of objects, not the fourth power of their number.
+
+Figures beside constants are of fields as in `tests/starid/identification/thesis/test_false_stars.py`, but of 60 stars in the sky among
+200 false ones, and, for a slow sensor, of a rotation by 0.05° a frame.
 """
 
 from __future__ import annotations
@@ -29,14 +32,31 @@ MAX_OBJECTS: Final = 2000
 """Largest number of objects in a frame."""
 
 _REFITS: Final = 3
+"""Rounds of matching and fitting. One round finds 85 % of the stars among 200 false ones, two or more find 98 %."""
+
 _MIN_OBJECTS: Final = 2
-_MIN_SCORE: Final = 2.0
+"""Number of objects that determine a motion of the plane or a rotation."""
+
 _SCATTER_FRAMES: Final = 3
+"""Number of sightings that a drift can contradict: position and velocity fit two. With 6, 88 instead of 90 % of what is called a
+star is one if false stars stay and the sensor is slow."""
+
 _MIN_SPREAD: Final = 0.5
+"""Least Σ(t − t̄)², frames²: three successive sightings have 1.9, but after 10⁷ frames its terms no longer have the digits."""
+
 _SUMS: Final = 13
+"""Number of the sums of `_Tracks`."""
+
 _FADING: Final = 0.95
+"""Weight of each frame beside the next, in which errors of the motion have added up: 20 frames count. From 0.9 to 1, at most 1 % more
+or fewer of the slow false stars are recognised."""
+
 _MOTION_NOISE: Final = 0.05
+"""Variance that a motion adds to each position, in units of that of a sighting: it is fitted to some 20 objects."""
+
 _TRIM: Final = 2.2
+"""Largest distance of a pair from which the motion is fitted, in medians: of true stars, 4 % are farther (Rayleigh)."""
+
 _LEAST_DEPTH: Final = 1e-3
 """Depth at which a direction behind the camera is put, so that its position is far outside the image."""
 
@@ -259,7 +279,7 @@ class TrackFilter:
             settings.max_shift_deg,
             change,
         )
-        if score < _MIN_SCORE:
+        if score < _MIN_OBJECTS:
             return None
         return self._motions.composed(self._motions.of_plane(change), start_motion)
 
