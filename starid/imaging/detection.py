@@ -107,7 +107,8 @@ class Detections:
     @property
     def sigma_px(self) -> Array:
         """Errors (n,) of the position, root mean square of both axes."""
-        return np.asarray(np.sqrt(np.mean(square(self.xy_sigma_px), axis=1)), dtype=np.float64)
+        variance = square(self.xy_sigma_px)
+        return np.asarray(np.sqrt(0.5 * (variance[:, 0] + variance[:, 1])), dtype=np.float64)
 
     @property
     def position_errors(self) -> Array:
