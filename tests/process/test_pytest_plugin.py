@@ -25,6 +25,10 @@ QUICK = 'extends = "ideal"\n[run]\nworker = "error_model"\n[camera]\ndistortion 
 """Profile of the emulators whose images do not matter."""
 
 
+WITHOUT = [f"-pno:{name}" for name in ("cacheprovider", "hypothesispytest", "xdist", "xdist.looponfail")]
+"""Options that load no plugin of others, which takes half of a start."""
+
+
 def run_pytest(folder: Path, programs: str | dict[str, str], *options: str, profile: str = QUICK) -> str:
     """Run programs of tests in a separate pytest; return its output."""
     files = programs if isinstance(programs, dict) else {"test_it.py": programs}
@@ -33,7 +37,7 @@ def run_pytest(folder: Path, programs: str | dict[str, str], *options: str, prof
     if profile:
         (folder / "quick.toml").write_text(profile)
         options = ("--starhil-profile=quick.toml", *options)
-    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-rs", "-v", *options, *files]
+    command = [sys.executable, "-m", "pytest", *WITHOUT, "-rs", "-v", *options, *files]
     done = subprocess.run(
         command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )

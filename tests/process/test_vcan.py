@@ -132,16 +132,11 @@ def test_candump_and_the_bench_log_the_same_frames(unit, dump, tmp_path):
         "[defaults]\ntimeout_s = 10.0\n"
         "[[step]]\nread = 'identification'\nrepeat = 20\nevery_s = 0\n[[step]]\nread = 'precise_attitude'\n"
     )
-    done = starhil("session", script, "--can", "vcan0", "--log", tmp_path)
+    done = starhil("session", script, "--can", "auto", "--log", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     logged = [str(frame) for _, frame in read_candump(tmp_path / "can.log") if frame.extended]
     assert len(logged) == 2 * 20 + 1 + 8
     assert dump(len(logged)) == logged
-
-
-def test_a_session_passes_on_the_kernel_bus(tmp_path, unit):
-    done = starhil("session", "first_light", "--can", "auto", "--assume-truth", "--log", tmp_path)
-    assert (done.returncode, done.stderr) == (0, ""), done.stdout
 
 
 def test_commands_are_answered_while_cangen_floods_the_bus(obc):
