@@ -30,7 +30,7 @@ WAIT_ABOVE: Final = 20
 BEAT_S: Final = 0.25
 """Longest time between two turns to a page that acknowledges them, seconds: by it a page knows how old what it shows is."""
 
-PAUSE_S: Final = 0.1
+PAUSE_S: Final = 0.2
 """Shortest time between two turns to a page that lacks nothing of the past, seconds: each makes the page draw."""
 
 TURN_TEXT: Final = 32 * 1024

@@ -37,7 +37,8 @@ def chromium():
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        arguments = ["--no-sandbox", "--disable-gpu"]  # which would be emulated on the processor
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
         yield browser
         browser.close()
 
@@ -89,6 +90,15 @@ def command(page, row, **values):
 def fault(page, **levels):
     """Inject faults."""
     assert ask(page, do="control", request={"do": "fault", **levels})["ok"]
+
+
+def reset(page):
+    """Bring back a page that several tests share: live, at a desk, in its first state, on a device without faults."""
+    page.set_viewport_size({"width": 1280, "height": 800})
+    page.evaluate(
+        "starhil.store.scrub(null); starhil.sky.reset(); document.activeElement.blur(); document.querySelectorAll('dialog[open]').forEach((each) => each.close())"
+    )
+    assert ask(page, do="control", request={"do": "clear_faults"})["ok"]
 
 
 @contextmanager

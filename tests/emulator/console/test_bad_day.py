@@ -9,7 +9,6 @@ from tests.emulator.console.browser import (
     AXE,
     MARKS,
     SlowLink,
-    ask,
     chromium,
     command,
     emulator_with_console,
@@ -17,6 +16,7 @@ from tests.emulator.console.browser import (
     let_pass,
     opened,
     requests_of,
+    reset,
     track,
     wait_for_text,
 )
@@ -52,11 +52,7 @@ def shared(browser, emulator):
 @pytest.fixture
 def page(shared):
     """The page of the module, live, at a desk, without faults."""
-    shared.set_viewport_size({"width": 1280, "height": 800})
-    shared.evaluate(
-        "starhil.store.scrub(null); document.activeElement.blur(); document.querySelectorAll('dialog[open]').forEach((each) => each.close())"
-    )
-    assert ask(shared, do="control", request={"do": "clear_faults"})["ok"]
+    reset(shared)
     track(shared)
     return shared
 
@@ -271,9 +267,10 @@ def test_messages_are_added_without_making_the_others_again_and_one_opens_with_i
 def test_more_messages_than_anyone_can_read_are_put_on_the_page_once_a_second(browser, emulator):
     with opened(browser, emulator.ready["view"]) as page:
         open_tab(page, "wire")
-        added = page.evaluate(
+        added, taken_s = page.evaluate(
             """async () => {
                 const added = [];
+                const begin = performance.now();
                 const list = document.querySelector("#wire .trace");
                 new MutationObserver((changes) => { added.push(changes.reduce((sum, change) => sum + change.addedNodes.length, 0)); }).observe(list, { childList: true });
                 const [bus] = Object.keys(starhil.store.hello.buses);
@@ -282,13 +279,13 @@ def test_more_messages_than_anyone_can_read_are_put_on_the_page_once_a_second(br
                     starhil.store.emit("wire", { items, left_out: 0 });
                     await new Promise((resolve) => setTimeout(resolve, 50));
                 }
-                return added;
+                return [added, (performance.now() - begin) / 1000];
             }"""
         )
         page.locator("#wire .trace li", has_text="turn 30").first.wait_for()
         page.locator("#wire input[type=search]").fill("turn")
         kept = page.locator("#wire .trace li", has_text="turn").count()
-    assert 1 <= len(added) <= 4
+    assert 1 <= len(added) <= 2 + taken_s
     assert max(added[1:], default=0) <= 100  # the newest; a filter shows the others
     assert kept == 400
 
@@ -358,7 +355,12 @@ def test_any_telemetry_field_is_plotted_and_a_part_of_the_time_is_enlarged_and_s
     page.check("#chooser input[value='precise_attitude.q_w']")
     page.check("#chooser input[value=true_ra]")
     page.click("#chooser button[value=plot]")
-    page.wait_for_function("() => starhil.store.samples.get('precise_attitude')?.length >= 20")
+    page.wait_for_function(  # some of them are in the part that is enlarged, which ends a second ago
+        """() => {
+            const found = starhil.store.samples.get("precise_attitude") || [];
+            return found.length >= 5 && found.at(-1)[0] - found[0][0] >= 5;
+        }"""
+    )
     assert page.locator("#plots .plot").count() == 6
     plot = page.locator("#plots .u-over").first
     plot.scroll_into_view_if_needed()
@@ -387,8 +389,10 @@ def test_any_telemetry_field_is_plotted_and_a_part_of_the_time_is_enlarged_and_s
     assert page.locator("#plots .plot").count() == 5
 
 
-SERIOUS = """async () => {
-    const runOnly = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"];
+RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
+COLOURS = ["color-contrast", "link-in-text-block"]
+"""The rules of RULES that look at colours, in which alone the themes differ."""
+SERIOUS = """async (runOnly) => {
     const { violations } = await axe.run(document, { resultTypes: ["violations"], runOnly });
     return violations.filter((each) => ["critical", "serious"].includes(each.impact)).map((each) => [each.id, each.nodes.length, each.nodes[0].target.join(" "), each.nodes[0].failureSummary]);
 }"""
@@ -398,7 +402,7 @@ STATES = ("live", "paused", "covered", "stuck", "standby", "error")
 @pytest.mark.skipif(not AXE.is_file(), reason="no axe-core: tools/install_test_packages tests, with npm")
 @pytest.mark.parametrize("state", STATES)
 def test_axe_finds_nothing_serious(page, state):
-    """In both themes: every panel, and every width, of a live page; a panel in the other states."""
+    """Every panel and every width of a live page, a panel in the other states; colours in both themes."""
     if state == "covered":
         fault(page, optical={"blank": True})
         wait_for_text(page, "#validity", "too few stars")
@@ -416,15 +420,19 @@ def test_axe_finds_nothing_serious(page, state):
     if not page.evaluate("Boolean(window.axe)"):
         page.evaluate(AXE.read_text())
     everywhere = state == "live"
+    if everywhere:
+        command(
+            page, "set_update_rate", rate=1
+        )  # also for the other states: images take half of the processor
+    panels = [(1280, tab) for tab in (TABS if everywhere else ("faults",))]
+    widths = [(width, "telecommands") for width in WIDTHS if everywhere and width != 1280]
     gaps = []
-    for _ in ("dark", "light"):
+    for rules, views in ((RULES, panels + widths), (COLOURS, panels + widths[:1])):
         page.click("#theme")
-        views = [(1280, tab) for tab in (TABS if everywhere else ("faults",))]
-        for width, tab in (*views, *((width, "telecommands") for width in WIDTHS if everywhere)):
+        for width, tab in views:
             page.set_viewport_size({"width": width, "height": 900})
             open_tab(page, tab)
-            violations = page.evaluate(SERIOUS)
-            gaps += [(width, tab, *each) for each in violations]
+            gaps += [(width, tab, *each) for each in page.evaluate(SERIOUS, rules)]
     if state == "error":
         command(page, "set_mode", mode="standby")
     assert gaps == []

@@ -16,11 +16,13 @@ from tests.emulator.console.browser import (
     MARKS,
     chromium,
     opened,
+    reset,
     wait_for_text,
 )
+from tests.process.conftest import NO_IMAGES
 from tests.waiting import PATIENCE_S
 
-UPDATE_RATE_HZ = 5
+UPDATE_RATE_HZ = 3
 
 pytestmark = MARKS
 
@@ -48,9 +50,22 @@ def browser():
 
 
 @pytest.fixture
-def page(browser, emulator):
+def own_page(browser, emulator):
+    """A page that a test leaves or changes for good."""
     with opened(browser, emulator.ready["view"]) as page:
         yield page
+
+
+@pytest.fixture(scope="module")
+def shared(browser, emulator):
+    with opened(browser, emulator.ready["view"]) as page:
+        yield page
+
+
+@pytest.fixture
+def page(shared):
+    reset(shared)
+    return shared
 
 
 def send(page, name, **values):
@@ -198,15 +213,15 @@ def test_a_page_for_viewing_only_has_no_control_that_commands(browser, emulator)
     opened.close()
 
 
-def test_what_was_sent_is_saved_and_run_as_a_session(page, emulator, tmp_path):
-    page.click("[data-tab=telecommands]")
-    page.click("#clear-session")
-    page.wait_for_function("() => document.querySelectorAll('#sent li').length === 0")
-    send(page, "set_mode", mode="standby")
-    send(page, "set_mode", mode="lost_in_space")
-    send(page, "set_update_rate", rate=500)
-    with page.expect_download() as download:
-        page.click("#save-session")
+def test_what_was_sent_is_saved_and_run_as_a_session(own_page, emulator, tmp_path):
+    own_page.click("[data-tab=telecommands]")
+    own_page.click("#clear-session")
+    own_page.wait_for_function("() => document.querySelectorAll('#sent li').length === 0")
+    send(own_page, "set_mode", mode="standby")
+    send(own_page, "set_mode", mode="lost_in_space")
+    send(own_page, "set_update_rate", rate=500)
+    with own_page.expect_download() as download:
+        own_page.click("#save-session")
     path = tmp_path / "session.toml"
     download.value.save_as(path)
     command = [
@@ -219,10 +234,10 @@ def test_what_was_sent_is_saved_and_run_as_a_session(page, emulator, tmp_path):
         item["name"] for item in json.loads(done.stdout)["results"] if not item["name"].startswith("wait")
     ]
     assert len(steps) == 3
-    page.goto(emulator.ready["view"].replace("/?", "/runs?"))
-    page.wait_for_function("() => document.querySelectorAll('#results tr.passed').length >= 3")
-    assert page.locator("#title").text_content() == "Recorded in the console"
-    assert page.locator("#list button").first.get_attribute("data-state") == "good"
+    own_page.goto(emulator.ready["view"].replace("/?", "/runs?"))
+    own_page.wait_for_function("() => document.querySelectorAll('#results tr.passed').length >= 3")
+    assert own_page.locator("#title").text_content() == "Recorded in the console"
+    assert own_page.locator("#list button").first.get_attribute("data-state") == "good"
 
 
 def test_the_page_can_be_paused_scrubbed_and_set_live_again_by_keys(page):
@@ -349,10 +364,10 @@ def test_an_image_that_cannot_be_decoded_is_said_and_the_next_one_is_shown(page)
     assert not page.locator("#no-frame").is_visible()
 
 
-def test_a_page_that_connects_to_another_run_shows_nothing_of_the_run_before(page):
-    track(page)
-    page.wait_for_function("() => starhil.sky.painted > 0")
-    *attitude, image = page.evaluate(
+def test_a_page_that_connects_to_another_run_shows_nothing_of_the_run_before(own_page):
+    track(own_page)
+    own_page.wait_for_function("() => starhil.sky.painted > 0")
+    *attitude, image = own_page.evaluate(
         """async () => {
             const { store, sky } = starhil;
             for (let turns = 0; sky.decoding && turns < 1000; turns++) await new Promise((resolve) => setTimeout(resolve, 10));
@@ -384,8 +399,8 @@ def test_a_page_whose_emulator_ended_is_grey_and_asks_for_the_address_of_the_nex
     with socket.create_server(("127.0.0.1", 0)) as free:
         where = f"127.0.0.1:{free.getsockname()[1]}"
     command = emulator_command(
-        profile="ideal", serial="off", can="off", seed=1, extra=["--clock", "stepped", "--view", where]
-    )
+        profile="ideal", serial="off", can="off", seed=1, settings=NO_IMAGES, extra=["--clock", "stepped", "--view", where]
+    )  # fmt: skip
     page = browser.new_page(viewport={"width": 420, "height": 900})
     page.set_default_timeout(1000 * PATIENCE_S)
     with EmulatorProcess(command) as process:

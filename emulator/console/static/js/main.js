@@ -185,20 +185,17 @@ $("reset").addEventListener("click", async () => {
 
 // Which link the OBC uses, how many requests per second since the last report, and when it sent the last one.
 let asked = null;
-let lastRequest = null; // time of the last request, ms since the page was opened
 
 store.on("status", ({ heard, wall_s: now }) => {
   const spoken = heard.filter((each) => each.age_s !== null).sort((a, b) => a.age_s - b.age_s);
   const total = heard.reduce((sum, each) => sum + each.requests, 0);
-  lastRequest = spoken.length ? performance.now() - 1000 * spoken[0].age_s : null;
+  setText($("obc-last"), spoken.length ? `${age(spoken[0].age_s)} ago` : "–");
   if (asked && now - asked.now < 2) return;
   const rate = asked && total >= asked.total ? (total - asked.total) / (now - asked.now) : 0;
   asked = { total, now };
   setText($("obc"), spoken.length ? `${spoken[0].link} ${fixed(rate, 1)}/s` : "silent");
   $("requests").title = heard.map((each) => `${each.link}: ${each.requests} requests${each.age_s === null ? "" : `, the last ${age(each.age_s)} ago`}`).join("\n");
 });
-
-setInterval(() => setText($("obc-last"), lastRequest === null ? "–" : `${age((performance.now() - lastRequest) / 1000)} ago`), 500);
 
 store.on("status", ({ status, unresponsive_since_s: since }) => {
   unresponsiveSince = since;
