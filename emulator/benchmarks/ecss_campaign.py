@@ -80,20 +80,27 @@ class EcssPlan:
     repeats: int = 4
     """Number of directions in the sky, sub-pixel positions for each, and frames for each position, to separate the
     kinds of error."""
-    thermal_fields: int = 24
     thermal_points: int = 12
-    """Number of directions, and of points of the orbit for each, for the thermo-elastic error."""
-    dated_fields: int = 40
+    """Number of points of the orbit for each direction, for the thermo-elastic error."""
     dates: int = 6
     dated_repeats: int = 2
-    """Number of directions, of dates over a year for each, and of frames for each date, for the aberration
-    residual."""
+    """Number of dates over a year for each direction, and of frames for each date, for the aberration residual."""
     rest_frames: int = 2000
     """Number of frames at rest, at random attitudes and points of the orbit."""
     frames: int = 100
     """Number of frames at each value of an influence."""
     chunk: int = 50
     """Frames per part; a resumed campaign repeats only unfinished parts."""
+
+    @property
+    def thermal_fields(self) -> int:
+        """Number of directions for the thermo-elastic error."""
+        return max(2, self.fields * 3 // 10)
+
+    @property
+    def dated_fields(self) -> int:
+        """Number of directions for the aberration residual."""
+        return max(2, self.fields // 2)
 
     def conditions(self) -> list[Condition]:
         static = Condition(STATIC, STATIC, 0.0, self.fields * self.positions * self.repeats)

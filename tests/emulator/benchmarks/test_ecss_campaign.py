@@ -19,7 +19,7 @@ pytestmark = pytest.mark.long
 
 SMALL = ["camera.width=320", "camera.height=320", "camera.fov_deg=30.0"]
 DRIFT = ["sensor.boresight_drift_x=2.0", "sensor.boresight_drift_z=6.0", "thermal.swing_c=10.0"]
-OPTIONS = ["--fields", "12", "--rest-frames", "20", "--frames", "5", "--seed", "4", "--json"]
+OPTIONS = ["--fields", "8", "--rest-frames", "20", "--frames", "5", "--seed", "4", "--json"]
 
 
 def campaign(folder, *settings: str, options: tuple = (), status: int = 0) -> dict:

@@ -23,12 +23,13 @@ from starhil.emulator.truth.orbit import KeplerOrbit
 
 pytestmark = pytest.mark.long
 
+SMALL = ("camera.width=320", "camera.height=320", "camera.fov_deg=30.0")
 PERIOD_S = 2.0 * math.pi * math.sqrt(6.928137e6**3 / 3.986004418e14)
 
 
 @pytest.fixture(scope="module")
 def device() -> OrbitDevice:
-    return OrbitDevice(OrbitPlan("ideal", frames=400))
+    return OrbitDevice(OrbitPlan("ideal", ("orbit=leo", *SMALL), frames=400))
 
 
 def test_the_zenith_frame_looks_away_from_the_earth_and_turns_once_per_revolution() -> None:
@@ -75,7 +76,7 @@ def test_every_influence_can_be_taken_away(device: OrbitDevice) -> None:
 
 
 def test_rows_add_up_and_a_part_is_the_same_again() -> None:
-    plan = OrbitPlan("ideal", frames=40, chunk=20)
+    plan = OrbitPlan("ideal", ("orbit=leo", *SMALL), frames=40, chunk=20)
     first, again = run_chunk(plan, 1), run_chunk(plan, 1)
     np.testing.assert_array_equal(first["outcome"], again["outcome"])
     np.testing.assert_array_equal(first["cause"], again["cause"])

@@ -18,7 +18,7 @@ def test_a_sender_whose_clock_slips_is_followed(speed, with_rate):
     live = LiveTruth(EAST, stale_s=1.0)
     rng = np.random.default_rng(1)
     worst_arcsec = worst_lag_s = 0.0
-    for n in range(3000):
+    for n in range(1000):
         t = 0.1 * n
         received = t / speed + rng.exponential(0.002)
         truth = SLEW.state(t)
@@ -30,9 +30,9 @@ def test_a_sender_whose_clock_slips_is_followed(speed, with_rate):
             if n > 100:
                 there = SLEW.state(speed * (received + later)).attitude
                 worst_arcsec = max(worst_arcsec, apart_arcsec(state.attitude, there))
-        if n > 100 and np.linalg.norm(truth.rate_rad_s) > math.radians(0.5):
-            behind = apart_arcsec(live.state(received).attitude, truth.attitude)
-            worst_lag_s = max(worst_lag_s, behind / 3600 / 0.5)
+            if later == 0.0 and n > 100 and np.linalg.norm(truth.rate_rad_s) > math.radians(0.5):
+                behind = apart_arcsec(state.attitude, truth.attitude)
+                worst_lag_s = max(worst_lag_s, behind / 3600 / 0.5)
     # the line lags by the slip of a window or two
     assert worst_lag_s < 0.05 + 8.0 * abs(1.0 / speed - 1.0)
     assert worst_arcsec < 0.8 * 3600 * (0.05 + 8.0 * abs(1.0 / speed - 1.0))
