@@ -13,7 +13,7 @@ from tests.waiting import until
 
 pytestmark = pytest.mark.long
 
-STEP_S = 30.0
+STEP_S = 12.0
 PEER_BYTES_S = 300_000.0
 """How fast the peer reads, bytes a second: slower than a step sends that does not wait."""
 

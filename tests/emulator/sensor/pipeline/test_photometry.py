@@ -18,7 +18,7 @@ pytestmark = pytest.mark.long
 
 
 @pytest.mark.parametrize(("profile", "low", "high"), [("cubestar", 3.25, 3.75), ("ideal", 5.5, 6.0)])
-def test_the_features_stop_where_the_detector_does(profile, low, high):
+def test_the_features_stop_where_the_detector_does_and_the_attitude_is_right(profile, low, high):
     device = EcssDevice(EcssPlan(profile, ("run.algorithm=lsi",), 3))
     request = next(iter(Comparison(AlgorithmPlan(profile, 1, 3))._images(Scene(0.0)))).request
     lsi = device.pipeline.identifier(request)
@@ -27,6 +27,11 @@ def test_the_features_stop_where_the_detector_does(profile, low, high):
     sensor = device.pipeline._sensor
     assert lsi.zero_point == pytest.approx(2.5 * math.log10(sensor.zero_magnitude_e_s))
     assert lsi.options.colour_term == sensor.colour_term
+    if profile == "ideal":
+        answer = device.pipeline.handle(request)
+        off = Attitude(np.array(answer.quaternion_xyzw)).error_to(request.truth.attitude)
+        assert answer.valid
+        assert off.total_arcsec < 20.0
 
 
 def stars_of_a_detector(rng, count, half=4.2, slope=6.0, sigma=0.07):
