@@ -91,7 +91,7 @@ def test_a_half_covered_field_is_identified_by_the_circles_of_a_divided_field(al
 
 def test_five_missing_stars_of_the_brightest_need_no_divided_field():
     rng = np.random.default_rng(12)
-    valid, images = 0, 24
+    valid, images = 0, 60
     for _ in range(images):
         attitude = random_attitude(rng)
         xy, flux = points(rng, attitude)
