@@ -322,6 +322,12 @@ def command(
             "change them (starhil docs profile)",
             file=sys.stderr,
         )
+    if any(each.identifier.get("refinement") is False for each in profiles):
+        print(
+            "note: without refinement, attitudes are valid whatever their stated uncertainty, and most are off by degrees "
+            "(starhil docs identification)",
+            file=sys.stderr,
+        )
     return run_loop(_serve(lambda: Emulator(profiles, options, take_worker())))
 
 

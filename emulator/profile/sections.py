@@ -115,7 +115,7 @@ class DeviceConfig(Strict):
     `min_stars_matched`, as lost in space."""
     largest_error_deg: Annotated[float, Field(ge=0.001, le=10.0)] = 0.1
     """Largest error across or about the boresight: an attitude is invalid if, by its own uncertainty, a larger one is likelier
-    than 1e-4."""
+    than 1e-4. Not of features alone (`identifier.refinement = false`)."""
     wrong_predictions: Annotated[float, Field(ge=0.0, le=1.0)] = 0.001
     """Share of the predicted attitudes that are assumed to be wrong by more than their uncertainty, because the body accelerates. The
     larger it is, the more stars an attitude in tracking needs."""

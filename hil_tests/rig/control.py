@@ -209,7 +209,11 @@ class Truth:
         keys = {} if unix_s is None else {"unix_s": unix_s}
         return unit(self._control.do("truth", **keys)["quaternion_xyzw"])
 
-    def error(self, quaternion_xyzw: list[float], unix_s: float) -> AttitudeDifference:
-        """Return the error of an attitude as the unit reports it, measured at a time of the device's clock."""
+    def error(self, quaternion_xyzw: list[float], unix_s: float | None = None) -> AttitudeDifference:
+        """Return the error of an attitude as the unit reports it, measured at a time of the device's clock, default: now.
+
+        That clock is not the computer's: until it is set, it starts at `run.start_unix_s`. A truth that moves needs the time
+        that the unit reports with the attitude.
+        """
         measured = from_reported(unit(quaternion_xyzw), self._conventions)
         return attitude_error(measured, self.attitude(unix_s))

@@ -19,11 +19,14 @@ static void write_port(void *uart, const uint8_t *bytes, size_t size)
 static void wait_for_reply(star_sensor_t *sensor, int port)
 {
     struct pollfd readable = {port, POLLIN, 0};
-    const uint32_t before = sensor->attitudes + sensor->acknowledges + sensor->refusals;
     uint8_t bytes[64];
-    while (sensor->attitudes + sensor->acknowledges + sensor->refusals == before && poll(&readable, 1u, 1000) > 0) {
-        const ssize_t size = read(port, bytes, sizeof bytes);
-        star_sensor_received(sensor, bytes, size > 0 ? (size_t)size : 0u);
+    while (sensor->is_waiting) {
+        if (poll(&readable, 1u, 1000) > 0) {
+            const ssize_t size = read(port, bytes, sizeof bytes);
+            star_sensor_received(sensor, bytes, size > 0 ? (size_t)size : 0u);
+        } else {
+            star_sensor_silent(sensor);
+        }
     }
 }
 
@@ -47,12 +50,12 @@ int main(int count, char **words)
     wait_for_reply(&sensor, port);
     for (tries = 0; tries < 100 && !(sensor.attitudes > 0u && sensor.attitude.valid); ++tries) {
         const struct timespec pause = {0, 200000000};
-        star_sensor_request_attitude(&sensor);
+        (void)star_sensor_request_attitude(&sensor);
         wait_for_reply(&sensor, port);
         (void)nanosleep(&pause, NULL);
     }
-    printf("acknowledges %u, refusals %u, faults %u\n", (unsigned)sensor.acknowledges, (unsigned)sensor.refusals,
-           (unsigned)sensor.faults);
+    printf("acknowledges %u, refusals %u, faults %u, lost %u\n", (unsigned)sensor.acknowledges,
+           (unsigned)sensor.refusals, (unsigned)sensor.faults, (unsigned)sensor.lost);
     printf("valid %d, q %.6f %.6f %.6f %.6f\n", (int)sensor.attitude.valid, (double)sensor.attitude.q_x,
            (double)sensor.attitude.q_y, (double)sensor.attitude.q_z, (double)sensor.attitude.q_w);
     return 0;

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +13,7 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.protocol.export import export_folder
 from starhil.protocol.export.packets import key_of
-from starhil.protocol.messages import ErrorCode
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
 from tests.protocol.export.c_driver import COMPILER, FLAGS, CDriver, c_words, hex_or_none
@@ -80,32 +81,72 @@ def test_a_refusal_comes_with_its_code(line: CDriver) -> None:
         assert line("ask", identifier, data)[:3] == [str(KINDS.index("nack")), str(identifier), str(code)]
 
 
-def test_the_component_of_the_docs_reads_the_attitude(emulator, tmp_path: Path) -> None:
+def make_component(folder: Path, main: str) -> Path:
+    """Compile the component of docs/c-export.md with a main function, and return the program."""
     if COMPILER is None:
         pytest.skip("no C compiler (cc, gcc or clang) here: the example of docs/c-export.md is not compiled")
     page = (Path(__file__).parents[2] / "docs" / "c-export.md").read_text(encoding="utf-8")
     files = dict(re.findall(r"^```c\n/\* (\S+) \*/\n(.*?)^```$", page, re.MULTILINE | re.DOTALL))
-    files["main.c"] = Path(__file__).with_name("star_sensor_main.c").read_text(encoding="utf-8")
-    for name, text in {**files, **export_folder(ICD, "c")}.items():
-        (tmp_path / name).write_text(text)
-    program = tmp_path / "example"
-    sources = sorted(tmp_path.glob("*.c"))
+    for name, text in {**files, "main.c": main, **export_folder(ICD, "c")}.items():
+        (folder / name).write_text(text)
+    program = folder / "example"
+    run_program(str(COMPILER), *FLAGS, "-o", program, *sorted(folder.glob("*.c")))
+    return program
+
+
+def run_program(*words: object) -> str:
     done = subprocess.run(
-        [str(COMPILER), *FLAGS, "-o", program, *sources], capture_output=True, text=True, check=False
+        list(map(str, words)), capture_output=True, text=True, check=False, timeout=PATIENCE_S
     )
     assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+def test_the_component_of_the_docs_reads_the_attitude(emulator, tmp_path: Path) -> None:
+    main = Path(__file__).with_name("star_sensor_main.c").read_text(encoding="utf-8")
+    program = make_component(tmp_path, main)
     with ObcClient.open(serial=emulator.ready["serial"], timeout_s=PATIENCE_S) as obc:
         obc.command("set_mode", mode="standby")  # as after boot
-    done = subprocess.run(
-        [program, emulator.ready["serial"]], capture_output=True, text=True, check=False, timeout=PATIENCE_S
-    )
-    assert (done.returncode, done.stderr) == (0, "")
-    counts, attitude = done.stdout.splitlines()
-    assert counts == "acknowledges 2, refusals 0, faults 0"
+    counts, attitude = run_program(program, emulator.ready["serial"]).splitlines()
+    assert counts == "acknowledges 2, refusals 0, faults 0, lost 0"
     with ObcClient.open(serial=emulator.ready["serial"], timeout_s=PATIENCE_S) as obc:
         truth = obc.wait_for("precise_attitude", lambda reading: bool(reading["valid"]), within_s=PATIENCE_S)
     seen = [float(word) for word in attitude.removeprefix("valid 1, q ").split()]
     assert seen == pytest.approx([truth[name] for name in ("q_x", "q_y", "q_z", "q_w")], abs=1e-4)
+
+
+COMPONENT_UNDER_BAD_REPLIES = r"""
+#include "star_sensor.h"
+#include <stdio.h>
+static void write_nothing(void *uart, const uint8_t *bytes, size_t size) { (void)uart; (void)bytes; (void)size; }
+static const uint8_t acknowledge[] = {0x1F, 0x7F, 0x00, 0x1F, 0xFF}, reply[] = {REPLY};
+int main(void)
+{
+    star_sensor_t sensor;
+    star_sensor_init(&sensor, write_nothing, NULL);
+    printf("%d ", star_sensor_set_time(&sensor, 1u));
+    printf("%d\n", star_sensor_request_attitude(&sensor));
+    star_sensor_silent(&sensor);
+    printf("%d\n", star_sensor_request_attitude(&sensor));
+    star_sensor_received(&sensor, acknowledge, sizeof acknowledge); /* of the time, too late */
+    star_sensor_received(&sensor, reply, sizeof reply);
+    printf("%u %u %u %u %u\n", (unsigned)sensor.attitudes, (unsigned)sensor.acknowledges,
+           (unsigned)sensor.refusals, (unsigned)sensor.faults, (unsigned)sensor.lost);
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize(("value", "counts"), [(0.25, "1 0 0 1 1"), (float("nan"), "0 0 0 2 1")])
+def test_the_component_of_the_docs_takes_no_bad_attitude_and_no_late_acknowledge(
+    value: float, counts: str, tmp_path: Path
+) -> None:
+    row = ICD.telemetry["precise_attitude"]
+    at = row.example() | {"q_x": 0.25}
+    data = row.encode(at).replace(struct.pack("<f", 0.25), struct.pack("<f", value))
+    line = CUBESTAR.encode_reply(Reply(ReplyKind.TELEMETRY, row.id, data), Dialect.B)
+    main = COMPONENT_UNDER_BAD_REPLIES.replace("REPLY", ", ".join(map(str, line)))
+    assert run_program(make_component(tmp_path, main)).splitlines() == ["0 -1", "0", counts]
 
 
 def test_a_unit_with_another_link_is_driven_through_its_c(sagitta, tmp_path: Path) -> None:

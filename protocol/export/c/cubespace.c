@@ -112,7 +112,7 @@ static unit_kind_t generation_2(const unit_receiver_t *receiver, unit_message_t 
     case START_ACK:
         return message->id >= FIRST_TELEMETRY ? UNIT_TELEMETRY : UNIT_ACK;
     case START_NACK:
-        return message->size == 1u ? with_code(message, UNIT_NACK) : UNIT_FAULT;
+        return message->size == 1u && message->data[0] != 0u ? with_code(message, UNIT_NACK) : UNIT_FAULT;
     case START_EVENT:
         return UNIT_EVENT;
     case START_UNSOLICITED:
@@ -126,11 +126,12 @@ static unit_kind_t generation_1(unit_receiver_t *receiver, unit_message_t *messa
 {
     const bool expected = receiver->is_pending && receiver->pending == message->id;
     if (message->id >= FIRST_TELEMETRY) {
-        receiver->is_pending = false;
-        if (message->size != 1u || !expected || unit_telemetry_size(message->id) == 1) {
-            return UNIT_TELEMETRY;
+        const bool is_code = expected && message->size == 1u && unit_telemetry_size(message->id) != 1;
+        if (is_code && message->data[0] == 0u) {
+            return UNIT_FAULT; /* an acknowledge that comes late: no refusal has the code 0 */
         }
-        return with_code(message, UNIT_NACK);
+        receiver->is_pending = false;
+        return is_code ? with_code(message, UNIT_NACK) : UNIT_TELEMETRY;
     }
     if (message->size != 1u) {
         return UNIT_FAULT;

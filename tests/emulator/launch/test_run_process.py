@@ -313,6 +313,16 @@ def test_a_unit_that_gets_the_sensor_of_the_default_profile_is_noted():
     assert (status, error[:9]) == (2, "starhil: ")
 
 
+def test_attitudes_that_are_valid_whatever_their_uncertainty_are_noted():
+    words = ("--can", "off", "--serial", "/dev/no_such_tty", "--set", "run.algorithm=rsi", "--set")
+    assert "note:" not in run_command_line("run", *words, "identifier.refinement=true")[2]
+    note, _ = log_lines(run_command_line("run", *words, "identifier.refinement=false")[2])
+    assert note == (
+        "note: without refinement, attitudes are valid whatever their stated uncertainty, and most are off by degrees "
+        "(starhil docs identification)"
+    )
+
+
 def check_rejected(arguments, message):
     status, out, err = run_command_line("run", "--can", "off", *arguments)
     assert (status, out) == (2, ""), err

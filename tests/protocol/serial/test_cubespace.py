@@ -256,6 +256,17 @@ def test_in_dialect_b_a_reply_to_nothing_is_a_fault() -> None:
     assert [event.kind for event in events] == [FaultKind.UART_PROTOCOL] * 2
 
 
+@pytest.mark.parametrize("dialect", Dialect)
+def test_no_refusal_has_the_code_0(dialect: Dialect) -> None:
+    receiver = CUBESPACE.host(dialect)
+    receiver.overhear(Request.of(230))
+    line = {Dialect.A: "1F7FE6001FFF", Dialect.B: "1F7F001FFF", Dialect.C: "1F0FE6001FFF"}[dialect]
+    (event,) = receiver.feed(bytes.fromhex(line), 0.0)
+    assert event.kind is FaultKind.UART_PROTOCOL
+    assert "an acknowledge of an earlier request" in event.detail
+    assert receiver.feed(CUBESPACE.encode_reply(TELEMETRY, dialect), 0.0) == [TELEMETRY]
+
+
 def test_in_dialect_b_one_expectation_takes_one_reply() -> None:
     receiver = CUBESPACE.host(Dialect.B)
     receiver.overhear(Request.of(230))
