@@ -1,6 +1,6 @@
 """Show what detection loses if a constant has another value: `python tools/vary_constant.py imaging.fits._RELAXED_SHARE 0.4 1`.
 
-The same images of ten skies are searched with the value of the source and with each given one. A constant that a compiled kernel
+The same images of some skies are searched with the value of the source and with each given one. A constant that a compiled kernel
 reads cannot be varied: the kernel in the cache holds the old value.
 """
 

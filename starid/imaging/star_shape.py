@@ -33,6 +33,10 @@ _STARS_FOR_WIDTH: Final = 15
 """Number of stars whose median width is that of the spot. With 7, four stars of 312 in hard skies are lost, and five more are
 false; with 30, three of 9505 are lost."""
 
+_LEAST_FOR_WIDTH: Final = 3
+"""Number of stars for a width from peaks that may be noise: with 1, an enlarged image of noise has five stars
+(`tests/starid/photograph/test_photographs.py`). Of those that stand out of an even sky, one is enough."""
+
 
 def shape_of_stars(scene: Scene, found: Peaks, assumed_px: float) -> SpotShape:
     """Estimate spot and trails from peaks of several pixels that stand out of an even sky.
@@ -43,18 +47,18 @@ def shape_of_stars(scene: Scene, found: Peaks, assumed_px: float) -> SpotShape:
     candidates = Candidates(scene, found.xy, found.heights, assumed_px, np.zeros(FLOW_TERMS))
     for most in (STARS_FOR_SHAPE, _PEAKS_FOR_SHAPE):
         tries = candidates.standing_out(found.several, most)
-        shape, complete = _estimate(scene, tries, assumed_px)
+        shape, complete = _estimate(scene, tries, assumed_px, 1)
         if complete or len(tries) < most:
             break
     if shape.stars == 0:
-        shape, _ = _estimate(scene, found.xy[found.several], assumed_px)
+        shape, _ = _estimate(scene, found.xy[found.several], assumed_px, _LEAST_FOR_WIDTH)
     if shape.stars == 0:
-        shape, _ = _estimate(scene, found.xy, assumed_px)
+        shape, _ = _estimate(scene, found.xy, assumed_px, _LEAST_FOR_WIDTH)
     return shape
 
 
-def _estimate(scene: Scene, peaks: Indices32, assumed_px: float) -> tuple[SpotShape, bool]:
-    """Estimate spot and trails from the brightest unsaturated stars.
+def _estimate(scene: Scene, peaks: Indices32, assumed_px: float, least: int) -> tuple[SpotShape, bool]:
+    """Estimate spot and trails from the brightest unsaturated stars, the spot from at least `least`.
 
     Also return whether more peaks would not change the estimate, because as many stars as it takes were measured.
     """
@@ -75,7 +79,7 @@ def _estimate(scene: Scene, peaks: Indices32, assumed_px: float) -> tuple[SpotSh
         growth = scene.settings.psf_growth
         fitted = spot_widths(scene.counts, tries, *scene.grids, start_px, scene.saturation, growth, widths)
         complete &= fitted == widths.size
-        if fitted > 0:
+        if fitted >= least:
             shape = dataclasses.replace(shape, sigma_px=float(np.median(widths[:fitted])), stars=fitted)
     return shape, complete
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import threading
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,6 +26,7 @@ from starhil.protocol.files.bundled import bundled, bundled_units
 from starid.storage import cache
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import CAMERA
+from tests.waiting import PATIENCE_S
 
 MEGABYTE = np.zeros(125_000)
 
@@ -174,6 +177,26 @@ def test_the_cache_is_warmed_for_a_unit_in_the_working_directory(
     assert run_command_line("unit", "new", "mine")[0] == 0
     assert run_command_line("cache", "warm", "--unit", "mine")[::2] == (0, "")
     assert len(pipeline.requests) == 1
+
+
+def test_warming_the_cache_reports_its_progress(
+    folder: Path, pipeline: StandIn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reported = threading.Event()
+
+    def count(_since: float) -> int:
+        reported.set()
+        return 7
+
+    def make(setup: PipelineSetup) -> tuple[StandIn, PipelineReady] | Failure:
+        reported.wait(PATIENCE_S)
+        return pipeline.make(setup)
+
+    monkeypatch.setattr("starhil.emulator.sensor.pipeline.pipeline.make_pipeline", make)
+    monkeypatch.setattr("starid.cli.output.PROGRESS_S", 0.05)
+    monkeypatch.setattr("starid.storage.cache.kernels_written_since", count)
+    _, _, said = run_command_line("cache", "warm", "cubestar")
+    assert re.match(r"starting: \d+ s, kernels added to the cache: 7; later runs use them\n", said)
 
 
 def test_a_failure_to_warm_the_cache_is_one_line(folder: Path, pipeline: StandIn) -> None:

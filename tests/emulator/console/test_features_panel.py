@@ -7,7 +7,7 @@ import pytest
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from tests.emulator.console.browser import MARKS
-from tests.emulator.console.test_browser import browser, page, send  # noqa: F401 (fixtures)
+from tests.emulator.console.test_browser import browser, page, send, shared  # noqa: F401 (fixtures)
 
 pytestmark = MARKS
 
