@@ -504,9 +504,16 @@ class HostReceiver:
         return ReplyKind.ACK if telecommand else ReplyKind.TELEMETRY
 
     def _reply_in_dialect(self, in_dialect: DialectReplies, body: bytes) -> Reply | LinkFault:
-        reply = in_dialect.decode(body, self._pending, self._reply_size)
-        if isinstance(reply, Reply) and reply.kind in (ReplyKind.ACK, ReplyKind.NACK, ReplyKind.TELEMETRY):
-            self._pending = None
+        pending = self._pending
+        reply = in_dialect.decode(body, pending, self._reply_size)
+        answers = (ReplyKind.ACK, ReplyKind.NACK, ReplyKind.TELEMETRY)
+        if (
+            isinstance(reply, Reply)
+            and reply.kind in answers
+            and pending is not None
+            and reply.id == pending.id
+        ):
+            self._pending = None  # a late reply to another request leaves this one pending
         return reply
 
 

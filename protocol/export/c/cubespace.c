@@ -130,13 +130,13 @@ static unit_kind_t generation_1(unit_receiver_t *receiver, unit_message_t *messa
         if (is_code && message->data[0] == 0u) {
             return UNIT_FAULT; /* an acknowledge that comes late: no refusal has the code 0 */
         }
-        receiver->is_pending = false;
+        receiver->is_pending = receiver->is_pending && !expected;
         return is_code ? with_code(message, UNIT_NACK) : UNIT_TELEMETRY;
     }
     if (message->size != 1u) {
         return UNIT_FAULT;
     }
-    receiver->is_pending = false;
+    receiver->is_pending = receiver->is_pending && !expected;
     return with_code(message, message->data[0] == 0u ? UNIT_ACK : UNIT_NACK);
 }
 

@@ -267,6 +267,15 @@ def test_no_refusal_has_the_code_0(dialect: Dialect) -> None:
     assert receiver.feed(CUBESPACE.encode_reply(TELEMETRY, dialect), 0.0) == [TELEMETRY]
 
 
+@pytest.mark.parametrize("late", [Reply(ReplyKind.TELEMETRY, 240, bytes(6)), Reply(ReplyKind.ACK, 2)])
+def test_in_dialect_a_a_late_reply_to_another_request_leaves_the_next_one_awaited(late: Reply) -> None:
+    receiver = CUBESPACE.host(Dialect.A)
+    receiver.overhear(Request.of(230))
+    refusal = Reply(ReplyKind.NACK, 230, code=ErrorCode.BUSY)
+    line = CUBESPACE.encode_reply(late, Dialect.A) + CUBESPACE.encode_reply(refusal, Dialect.A)
+    assert receiver.feed(line, 0.0) == [late, refusal]
+
+
 def test_in_dialect_b_one_expectation_takes_one_reply() -> None:
     receiver = CUBESPACE.host(Dialect.B)
     receiver.overhear(Request.of(230))
