@@ -160,7 +160,7 @@ class DialectReplies:
                 return LinkFault(FaultKind.UART_PROTOCOL, f"{name} {row_id} has {codes} bytes, must be 1")
             code = error_code(body[-1])
             if kind is ReplyKind.NACK and not code:  # no refusal has the code 0
-                text = f"code 0 in place of telemetry {row_id}: an acknowledge of an earlier request?"
+                text = f"NACK of {row_id} with the code 0, which is no error: an acknowledge of an earlier request?"
                 return LinkFault(FaultKind.UART_PROTOCOL, text)
             kind = ReplyKind.NACK if code else kind
         return Reply(
