@@ -56,6 +56,8 @@ class AsyncObcClient:
         )
         self.unsolicited_dropped = 0
         self.bursts: asyncio.Queue[bytes] = asyncio.Queue()
+        self._understood = False
+        """Whether a reply was one of the dialect of the link, so that what is none is not of another dialect."""
         self._turn = asyncio.Lock()
         self._pending: tuple[Request, asyncio.Future[tuple[Reply, float]]] | None = None
         link.on_reply = self._on_reply
@@ -214,14 +216,20 @@ class AsyncObcClient:
     ) -> tuple[Reply, float]:
         """Send a request and return its reply and latency.
 
-        The row ID need not be in the definition.
+        The row ID need not be in the definition. Raises BadReplyError: the first reply is one of another dialect.
         """
         limit = self.timeout_s if timeout_s is None else timeout_s
         attempts = 1 + (self.retries if retries is None else retries)
         async with self._turn:
             for left in reversed(range(attempts)):
                 answer = await self._attempt(request, limit)
-                if answer is not None and not (left and self._is_incomplete(answer[0])):
+                whole = answer is not None and not self._is_incomplete(answer[0])
+                self._understood = self._understood or whole
+                if not self._understood and (dialect := self.link.dialect_of_reply(request)):
+                    raise BadReplyError(
+                        f"{name}: the unit replies in dialect {dialect}; choose it: --dialect {dialect}"
+                    )
+                if answer is not None and (whole or not left):
                     return self._checked_reply(name, *answer)
                 self.transactions.append(Transaction(name, "no_reply", float("inf")))
         self.link.check()

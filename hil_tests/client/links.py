@@ -15,7 +15,7 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Row
-from starhil.protocol.messages import LinkFault, Receiver, Reply, Request
+from starhil.protocol.messages import LinkFault, Receiver, Reply, ReplyKind, Request
 from starhil.protocol.serial.stack import HostReceiver, SerialStack, chosen_dialect
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.can import open_can
@@ -75,6 +75,10 @@ class HostLink(ABC, Generic[Item]):
     def marks_unsolicited(self, message_class: str) -> bool:  # noqa: ARG002 -- on most links, all of it
         """Return whether unsolicited telemetry of a class says that it is."""
         return True
+
+    def dialect_of_reply(self, request: Request) -> str | None:  # noqa: ARG002 -- only a serial line has dialects
+        """Return the dialect, other than that of the link, in which what came since a request is its reply."""
+        return None
 
     def is_from_device(self, item: Item) -> bool:  # noqa: ARG002 -- a serial line has only one peer
         """Return whether the device has sent a received item."""
@@ -150,12 +154,34 @@ class SerialHostLink(HostLink[bytes]):
         log: WireLog | None = None,
     ) -> None:
         self._stack = SerialStack(icd)
-        host = partial(self._stack.host, chosen_dialect(icd, dialect))
+        self._dialect = chosen_dialect(icd, dialect)
+        self._since_request = bytearray()
+        host = partial(self._stack.host, self._dialect)
         super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log, host)
 
     def request(self, request: Request) -> None:
         """Frame and send a request."""
+        self._since_request.clear()
         self.send(self._receiver.request(request))
+
+    def _on_receive(self, item: bytes) -> None:
+        self._since_request += item[: self._stack.max_size - len(self._since_request)]
+        super()._on_receive(item)
+
+    def dialect_of_reply(self, request: Request) -> str | None:
+        """Return the dialect, other than that of the link, in which what came since a request is its reply."""
+        row = self._stack.icd.row(request.id, request.message_class)
+        kinds = ReplyKind.ACK, ReplyKind.NACK, ReplyKind.TELEMETRY
+        for dialect in self._stack.dialects:
+            receiver = self._stack.host(dialect)
+            receiver.request(request)
+            for reply in receiver.feed(bytes(self._since_request), 0.0):
+                if isinstance(reply, LinkFault) or reply.id != request.id or reply.kind not in kinds:
+                    continue
+                whole = row is None or reply.kind is not ReplyKind.TELEMETRY or len(reply.data) == row.size
+                if whole and dialect is not self._dialect:
+                    return dialect.value
+        return None
 
     def marks_unsolicited(self, message_class: str) -> bool:
         """Return whether unsolicited telemetry of a class says that it is."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo
 
@@ -19,6 +19,10 @@ from starhil.protocol.errors import OneLineError, did_you_mean
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.values import Parameter
+from starhil.protocol.serial.stack import dialects_of
+
+Answers: TypeAlias = list[str] | dict[str, list[str]]
+"""Patterns of an answer, or those in each dialect."""
 
 
 def _read_by(read: Callable[[str, InterfaceDefinition], Any]) -> PlainValidator:
@@ -89,6 +93,29 @@ def _as_list(value: Any) -> Any:
     return [value] if isinstance(value, str) else value
 
 
+def _patterns(value: Any) -> list[str]:
+    texts = _as_list(value)
+    if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
+        raise ValueError("must be a text, or a list of texts")
+    try:
+        return [pattern(text) for text in texts]
+    except OneLineError as error:
+        raise ValueError(str(error)) from None
+
+
+def _answers(value: Any, info: ValidationInfo) -> Answers:
+    if not isinstance(value, dict):
+        return _patterns(value)
+    icd: InterfaceDefinition = (info.context or {})["icd"]
+    dialects = dialects_of(icd.link.serial)
+    if set(value) != set(dialects):
+        known, given = (", ".join(names) or "none" for names in (dialects, value))
+        raise ValueError(
+            f"a table has an answer for each dialect of unit {icd.name} ({known}), not for {given}"
+        )
+    return {dialect: _patterns(answer) for dialect, answer in value.items()}
+
+
 def check_json(table: dict[str, Any]) -> dict[str, Any]:
     """Return a table that can be written as JSON."""
     try:
@@ -112,8 +139,7 @@ Refusal = Annotated[str, _read_by(_refusal)]
 HexBytes = Annotated[bytes, _read_by(_hex_bytes)]
 RawItem = Annotated[bytes | CanFrame, _read_by(_raw_item)]
 RawItems = Annotated[list[RawItem], BeforeValidator(_as_list), AfterValidator(_of_one_link)]
-Pattern = Annotated[str, _read_by(lambda text, _icd: pattern(text))]
-Patterns = Annotated[list[Pattern], BeforeValidator(_as_list)]
+ReadAnswers = Annotated[Answers, PlainValidator(_answers)]
 FileName = Annotated[str, AfterValidator(_file_name)]
 Texts = Annotated[list[str], BeforeValidator(_as_list)]
 LONGEST_S: Final = 1e6

@@ -24,9 +24,9 @@ from starhil.hil_tests.session.step_keys import (
     FileName,
     HexBytes,
     ParameterName,
-    Patterns,
     RawItems,
     Readable,
+    ReadAnswers,
     Telecommand,
     Telemetry,
     check_json,
@@ -36,6 +36,7 @@ from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.values import Value
+from starhil.protocol.serial.stack import chosen_dialect
 from starid.storage.files import open_output
 
 CLOCK_GRAIN_S: Final = 1e-6
@@ -281,12 +282,12 @@ class DownloadImage(Step):
 class Send(Step):
     """Send raw bytes in hexadecimal (serial) or CAN frames in the format of `cansend`, and check the answer.
 
-    The format determines the link. Without `answer`, anything may be answered.
+    The format determines the link. Without `answer`, anything may be answered; it can be a table of answers by dialect.
     """
 
     default_name = "send raw data"
     data: RawItems = Field(alias="send")
-    answer: Patterns | None = None
+    answer: ReadAnswers | None = None
     listen_s: Duration = 0.3
 
     @model_validator(mode="after")
@@ -297,6 +298,8 @@ class Send(Step):
     def run(self, session: SessionState, link: str) -> Attempt:
         """Send the data and compare what comes back."""
         patterns = self.answer or []
+        if isinstance(patterns, dict):
+            patterns = patterns[str(chosen_dialect(session.rig.icd, session.rig.options.dialect))]
         client = session.rig.client(link)
         listening = send_and_listen(client.core, self.data, self.listen_s, patterns, self.timeout_s)
         received = client.run(listening)

@@ -61,6 +61,9 @@ class FakeLink:
     def answers(self, row):
         return row.answers
 
+    def dialect_of_reply(self, _request):
+        """This link has no dialects."""
+
     def request(self, request):
         self.requests.append(request)
         for reply in self.replies:

@@ -47,6 +47,7 @@ def starhil(*words: object) -> subprocess.CompletedProcess[str]:
         ("image_download", ["--serial", "auto"]),
         ("parameters", ["--serial", "auto", "--profile", QUICK]),
         ("errors", ["--serial", "auto", "--can", "auto", "--profile", QUICK]),
+        ("errors", ["--serial", "auto", "--dialect", "a", "--profile", QUICK]),
     ],
     ids=lambda value: value if isinstance(value, str) else "-".join(word[2:] for word in value[::2]),
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import time
 
 import pytest
@@ -98,6 +99,35 @@ def test_a_refusal_is_an_error_with_the_published_code(pair, code):
     assert client.transactions[-1].outcome == code.name.lower()
 
 
+@pytest.mark.parametrize("request_of", ["read", "command"])
+@pytest.mark.parametrize(("spoken", "expected"), list(itertools.permutations("abc", 2)))
+def test_a_reply_in_another_dialect_is_named_with_that_dialect(spoken, expected, request_of):
+    with FakeDevice(Dialect(spoken)) as device:
+        device.telemetry["rates"] = {"rate_x": 0.3}
+        port = device.open_serial()
+        with ObcClient.open(serial=port, dialect=expected, timeout_s=TIMEOUT_S) as client:
+            for _ in range(2):
+                with pytest.raises(
+                    BadReplyError, match=rf"replies in dialect {spoken}; .*--dialect {spoken}$"
+                ):
+                    client.read("rates") if request_of == "read" else client.command("clear_counters")
+
+
+@pytest.mark.parametrize("dialect", Dialect)
+def test_a_damaged_reply_of_the_own_dialect_is_not_taken_for_one_of_another(dialect):
+    """In dialect b, what follows the ID of a late reply in dialect a could be the row that is awaited."""
+    with (
+        FakeDevice(dialect) as device,
+        ObcClient.open(serial=device.open_serial(), dialect=dialect, timeout_s=TIMEOUT_S) as client,
+    ):
+        client.read("rates")
+        for other in set(Dialect) - {dialect}:
+            device.dialect = other
+            with pytest.raises((NoReplyError, BadReplyError)) as caught:
+                client.read("rates")
+            assert "dialect" not in str(caught.value)
+
+
 def test_names_that_are_not_in_the_definition_are_rejected_before_anything_is_sent(pair):
     device, client = pair
     with pytest.raises(ProtocolError, match="set_mode"):
@@ -163,6 +193,9 @@ class CanThatLosesAFrame:
 
     def check(self) -> None:
         """Nothing is wrong."""
+
+    def dialect_of_reply(self, _request: Request) -> None:
+        """On CAN there are no dialects."""
 
 
 @pytest.mark.parametrize("lost", [0, 1, -2], ids=["first", "second", "none"])

@@ -188,6 +188,23 @@ def test_values_that_a_correct_obc_never_sends_are_allowed_where_a_refusal_is_ex
     assert script.steps[0].refused == "invalid_parameter"
 
 
+@pytest.mark.parametrize(
+    ("unit", "answer", "message"),
+    [
+        ("cubestar", "{ a = '00', b = '01' }", r"answer: .* of unit cubestar \(a, b, c\), not for a, b$"),
+        ("cubestar", "{ a = '0', b = '01', c = '02' }", r"answer: not bytes .*: '0'"),
+        ("cubestar", "['0']", r"answer: not bytes .*: '0'"),
+        ("cubestar", "[0]", r"answer: must be a text, or a list of texts"),
+        ("sagitta", "{ a = '00' }", r"answer: .* of unit sagitta \(none\), not for a$"),
+    ],
+)
+def test_an_answer_that_no_dialect_of_the_unit_has_is_reported(unit, answer, message, tmp_path):
+    path = tmp_path / "trial.toml"
+    path.write_text(f"[[step]]\nsend = '00'\nanswer = {answer}")
+    with pytest.raises(ScriptError, match=message):
+        load_script(path, load_unit(unit))
+
+
 def test_a_refusal_is_named_by_the_errors_of_the_unit(tmp_path):
     path = tmp_path / "trial.toml"
     errors = "\n[errors]\nok = 0\nother = 9\n"
