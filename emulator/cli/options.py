@@ -28,8 +28,10 @@ def list_option(*kinds: Kind) -> Any:
             return
         for kind in kinds:
             print(f"{kind}s:")
-            for name, path in bundled(kind).items():
-                print(f"  {name:<16}  {_description(path.read_text(encoding='utf-8'))}")
+            found = bundled(kind)
+            width = max(map(len, found))
+            for name, path in found.items():
+                print(f"  {name:<{width}}  {_description(path.read_text(encoding='utf-8'))}")
         raise typer.Exit
 
     what = " and ".join(f"{kind}s" for kind in kinds)

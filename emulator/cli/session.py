@@ -46,6 +46,13 @@ def command(
         bool,
         typer.Option("--assume-truth", help="The unit looks where the script's table truth says."),
     ] = False,
+    intrusive: Annotated[
+        bool,
+        typer.Option(
+            "--intrusive",
+            help="Without --start and --control: the unit may be restarted, and what it stores erased or overwritten.",
+        ),
+    ] = False,
     baud: Annotated[int, typer.Option(help="Bit rate of a real serial line.")] = 115200,
     keep_going: Annotated[bool, typer.Option("--keep-going", help="Continue after a failed step.")] = False,
     as_json: AsJson = False,
@@ -83,6 +90,7 @@ def command(
         truth,
         control,
         assume_truth,
+        intrusive,
         keep_going,
         quiet=as_json,
         view=bench.view,

@@ -29,7 +29,7 @@ from starhil.hil_tests.session.results import SessionResult, StepResult, junit_c
 from starhil.hil_tests.session.script import Script, load_script
 from starhil.hil_tests.session.session import run_steps
 from starhil.hil_tests.session.step import BOOTING
-from starhil.hil_tests.session.steps import Control, Listen
+from starhil.hil_tests.session.steps import Command, Control, Listen
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.files.bundled import DEFAULT_UNIT, find, not_found
 from starhil.protocol.icd import InterfaceDefinition
@@ -37,6 +37,8 @@ from starhil.protocol.unit import load_unit
 
 TRUTH_WITHIN_ARCSEC: Final = 1.0
 """Largest difference of two truths that are the same."""
+INTRUSIVE_ACTIONS: Final = frozenset({"reset", "save_parameters", "erase_file", "format_card"})
+"""Actions of telecommands that restart a unit, or erase or overwrite what it stores."""
 DEFAULT_FOLDER: Final = Path("out") / "session"
 STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED: ("-", "yellow")}
 
@@ -57,6 +59,8 @@ class SessionRequest:
     """Address of the control channel of an emulator that runs already."""
     assume_truth: bool = False
     """Whether the unit is known to look where the script has the truth."""
+    intrusive: bool = False
+    """Whether a unit that is not known to be an emulator may be restarted, and what it stores erased or overwritten."""
     keep_going: bool = False
     quiet: bool = False
     view: str | None = None
@@ -210,6 +214,13 @@ def _check_steps(
                 f"{path.name}: compares attitudes with its [truth], and nothing shows that the unit looks there: use --start; or give "
                 f"--assume-truth if it does; or {control}"
             )
+    commands = {step.row.name: step.row.action for step in script.steps if isinstance(step, Command)}
+    intrusive = [name for name, action in commands.items() if action in INTRUSIVE_ACTIONS]
+    if intrusive and not controlled and not request.intrusive:
+        raise ScriptError(
+            f"{path.name}: restarts the unit, or erases or overwrites what it stores ({', '.join(intrusive)}): use --start; or give "
+            "--intrusive if it may; or, for an emulator that runs, --control with the address on its ready line"
+        )
     for number, step, link in script.planned(links):
         why = ""
         if step.needs_emulator and not request.start:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from starhil.protocol.files.bundled import bundled
@@ -56,8 +58,10 @@ def test_other_shells_are_answered_too(monkeypatch: pytest.MonkeyPatch, shell: s
 def test_what_ships_is_listed_with_a_description(words: list[str], kinds: list[str]) -> None:
     status, out, _ = run_command_line(*words, "--list")
     assert status == 0
-    rows = [line.split(maxsplit=1) for line in out.splitlines() if line.startswith(" ")]
-    assert [name for name, _ in rows] == [name for kind in kinds for name in bundled(kind)]
+    lists = [part.splitlines()[1:] for part in re.split(r"(?m)^(?=\w)", out) if part]
+    assert [[line.split()[0] for line in lines] for lines in lists] == [[*bundled(kind)] for kind in kinds]
+    for lines in lists:  # in columns
+        assert len({line.index(line.split(maxsplit=1)[1]) for line in lines}) == 1
 
 
 @pytest.mark.process

@@ -8,6 +8,7 @@ import json
 import re
 import signal
 import threading
+from dataclasses import replace
 from itertools import pairwise
 from xml.etree import ElementTree as ET
 
@@ -18,16 +19,24 @@ from typer.testing import CliRunner
 from starhil.emulator.cli.app import build_app
 from starhil.emulator.profile import load_profile
 from starhil.hil_tests.attitude import attitude_error, from_radec_roll, unit
-from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.errors import BenchError, ScriptError
 from starhil.hil_tests.rig.interruption import Interrupted
 from starhil.hil_tests.rig.rig import LinkOptions, Rig
 from starhil.hil_tests.session import SessionRequest, run_session
 from starhil.hil_tests.session.results import junit_cases
 from starhil.hil_tests.session.script import load_script
 from starhil.hil_tests.session.session import run_steps
-from starhil.hil_tests.session.session_run import _emulator, _print_result, _running_step, find_script
+from starhil.hil_tests.session.session_run import (
+    INTRUSIVE_ACTIONS,
+    _emulator,
+    _print_result,
+    _running_step,
+    find_script,
+)
 from starhil.hil_tests.session.step import BOOTING
+from starhil.protocol.icd.device_model import device_model
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
 from starid.errors import StaridError
 from tests.candump import read_candump
@@ -439,6 +448,48 @@ def test_bytes_are_sent_and_the_answer_compared(play, device):
         """
     )
     assert [item.status for item in result.results] == ["passed", "failed", "passed"]
+
+
+@pytest.mark.parametrize("dialect", Dialect)
+def test_bytes_are_compared_with_the_answer_in_the_dialect_of_the_session(device, tmp_path, dialect):
+    device.dialect = dialect
+    errors = find_script("errors").read_text()
+    (step,) = (text for text in errors.split("[[step]]") if "dialect" not in text and "{ a = " in text)
+    path = tmp_path / "trial.toml"
+    path.write_text(f"[[step]]\n{step}[[step]]\n{step.replace('01 1F FF', '02 1F FF')}")
+    options = LinkOptions(serial=device.open_serial(), dialect=dialect, timeout_s=0.2)
+    script = load_script(path, ICD)
+    script.defaults.keep_going = True
+    with Rig(options, ICD) as rig:
+        result = run_steps(script, rig, tmp_path)
+    assert [item.status for item in result.results] == ["passed", "failed"]
+
+
+def test_a_step_that_fails_because_the_unit_replies_in_another_dialect_names_it(device, tmp_path):
+    device.dialect = Dialect.A
+    path = tmp_path / "trial.toml"
+    path.write_text("[[step]]\nread = 'device_status'\nwithin_s = 0.1\nevery_s = 0.01\n")
+    with Rig(LinkOptions(serial=device.open_serial()), ICD) as rig:
+        (result,) = run_steps(load_script(path, ICD), rig, tmp_path).results
+    assert "device_status: the unit replies in dialect a; choose it: --dialect a" in result.detail
+
+
+def test_a_session_that_resets_or_erases_needs_consent_for_a_unit_that_may_be_real(device, tmp_path):
+    path = tmp_path / "trial.toml"
+    path.write_text(
+        "[[step]]\nread = 'rates'\n[[step]]\ncommand = 'erase_file'\nwith = { all = true }\n"
+        "[[step]]\ncommand = 'reset'\nwith = { magic = 90 }\n[[step]]\nread = 'rates'\n"
+    )
+    request = SessionRequest(path, LinkOptions(serial=device.open_serial()), folder=tmp_path, quiet=True)
+    with pytest.raises(ScriptError, match=r"what it stores \(erase_file, reset\): .* --intrusive if it may;"):
+        run_session(request)
+    assert device.received == []
+    assert run_session(replace(request, intrusive=True)).passed
+    assert [row for row, _ in device.received] == ["erase_file", "reset"]
+
+
+def test_actions_that_need_consent_are_those_of_the_device():
+    assert set(device_model().actions) >= INTRUSIVE_ACTIONS
 
 
 def test_links_are_chosen_by_step_and_a_missing_one_is_skipped(play, device, hub):
