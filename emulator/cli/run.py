@@ -324,8 +324,8 @@ def command(
         )
     if any(each.identifier.get("refinement") is False for each in profiles):
         print(
-            "note: without refinement, attitudes are valid whatever their stated uncertainty, and most are off by degrees "
-            "(starhil docs identification)",
+            "note: identifier.refinement=false is for experiments: attitudes are valid whatever their stated uncertainty, and most are "
+            "off by degrees (starhil docs identification)",
             file=sys.stderr,
         )
     return run_loop(_serve(lambda: Emulator(profiles, options, take_worker())))

@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import itertools
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,7 +40,7 @@ from starid.identification.solution import FeatureReport, Reason, Search, Soluti
 from starid.identification.thesis.answer_sequence import AnswerSequence, KeptAnswer
 from starid.identification.thesis.database import DatabaseParameters, sky_of
 from starid.identification.thesis.database_choice import given_database, obtain_database
-from starid.identification.thesis.feature_error import RANDOM, FeatureErrors, Photometry
+from starid.identification.thesis.feature_error import FIELDS, RANDOM, FeatureErrors, Photometry
 from starid.identification.thesis.feature_search import (
     ESTIMATE_SHARE,
     MIN_STARS,
@@ -51,6 +52,8 @@ from starid.identification.thesis.lsi import LostInSpace
 from starid.identification.thesis.parts import Parts
 from starid.kernels.kernel_cache import kernels_key
 from starid.storage.cache import Tables, cached_tables
+
+_log = logging.getLogger(__name__)
 
 STARS_PER_FIELD: Final = 10
 """Number of stars per field for the default brightness limit of the features: fewer make fields alike, and with more
@@ -186,6 +189,11 @@ class LsiIdentifier(VerifiedIdentifier):
         limits = REGION_DEG, options.threshold, options.largest_error_psi
 
         def measured() -> Tables:
+            _log.warning(
+                "measuring the uncertainty of features in %d simulated sequences of images, which takes tens of seconds%s",
+                FIELDS,
+                "; later starts with this camera and these options use the result" if options.cache else "",
+            )
             return FeatureErrors.of_search(self.search, photometry, *limits).arrays
 
         if not options.cache or options.database is not None or self._parts != Parts():

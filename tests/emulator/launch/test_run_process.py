@@ -318,8 +318,8 @@ def test_attitudes_that_are_valid_whatever_their_uncertainty_are_noted():
     assert "note:" not in run_command_line("run", *words, "identifier.refinement=true")[2]
     note, _ = log_lines(run_command_line("run", *words, "identifier.refinement=false")[2])
     assert note == (
-        "note: without refinement, attitudes are valid whatever their stated uncertainty, and most are off by degrees "
-        "(starhil docs identification)"
+        "note: identifier.refinement=false is for experiments: attitudes are valid whatever their stated uncertainty, and most are "
+        "off by degrees (starhil docs identification)"
     )
 
 
