@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import shlex
 import sys
@@ -42,30 +43,35 @@ def _number(name: str, digits: int) -> Callable[[dict[str, Any]], str]:
     return lambda row: "" if row[name] is None else f"{row[name]:.{digits}f}"
 
 
-_ALGORITHM_COLUMNS: Final[tuple[Column, ...]] = (
-    ("scene", lambda row: row["scene"]),
-    ("algorithm", lambda row: row["algorithm"]),
-    ("frames", lambda row: str(row["frames"])),
-    ("valid %", _number("valid_pct", 1)),
-    ("1 SE", _number("valid_error_pct", 1)),
-    ("wrong", lambda row: str(row["wrong"])),
-    ("right %", _number("right_pct", 1)),
-    ("1 SE", _number("right_error_pct", 1)),
-    ("within .3 %", _number("within_pct", 1)),
-    ("1 SE", _number("within_error_pct", 1)),
-    ("across deg", _number("across_deg", 4)),
-    ("about deg", _number("about_deg", 4)),
-    ("stated deg", _number("stated_deg", 4)),
-    ("chi2", _number("normalised_squared_error", 2)),
-    ("1 SE", _number("normalised_squared_error_error", 2)),
-    ("region", lambda row: str(row["in_region"])),
-    ("triggers", lambda row: str(row["triggers"])),
-    ("stars kept %", _number("true_kept_pct", 0)),
-    ("false kept %", _number("false_kept_pct", 0)),
-    ("ms", _number("median_ms", 2)),
-    ("p99 ms", _number("p99_ms", 1)),
-    ("kB", _number("kilobytes", 0)),
+def _with_error(name: str, error: str, digits: int) -> Callable[[dict[str, Any]], str]:
+    number, sampling = _number(name, digits), _number(error, digits)
+    return lambda row: number(row) + (f" ± {text}" if (text := sampling(row)) else "")
+
+
+def _numbers(digits: int, *names: str) -> Callable[[dict[str, Any]], str]:
+    numbers = [_number(name, digits) for name in names]
+    return lambda row: ", ".join(text for number in numbers if (text := number(row)))
+
+
+_ALGORITHM_FIGURES: Final[tuple[Column, ...]] = (
+    ("images", _number("frames", 0)),
+    ("valid, %", _with_error("valid_pct", "valid_error_pct", 1)),
+    ("wrong", _number("wrong", 0)),
+    ("right, %", _with_error("right_pct", "right_error_pct", 1)),
+    ("across within 0.3°, %", _with_error("within_pct", "within_error_pct", 1)),
+    ("median error across, about, °", _numbers(4, "across_deg", "about_deg")),
+    ("stated across, °", _number("stated_deg", 4)),
+    (
+        "squared error / stated",
+        _with_error("normalised_squared_error", "normalised_squared_error_error", 2),
+    ),
+    ("answers from a region", _number("in_region", 0)),
+    ("filter triggered", _number("triggers", 0)),
+    ("kept of true, false stars, %", _numbers(0, "true_kept_pct", "false_kept_pct")),
+    ("median time, 99 %, ms", _numbers(1, "median_ms", "p99_ms")),
+    ("database, kB", _number("kilobytes", 0)),
 )
+"""Figures of an algorithm; after ±, one standard error."""
 
 _ORBIT_COLUMNS: Final[tuple[Column, ...]] = (
     ("attitude, or cause of none", lambda row: row["cause"]),
@@ -74,21 +80,16 @@ _ORBIT_COLUMNS: Final[tuple[Column, ...]] = (
 )
 
 _TRACKING_COLUMNS: Final[tuple[Column, ...]] = (
-    ("last image solved", lambda row: row["way"]),
+    ("last image", lambda row: row["way"]),
     ("images", lambda row: str(row["frames"])),
     ("valid", lambda row: str(row["valid"])),
     ("wrong", lambda row: str(row["wrong"])),
-    ("across median, 99 % arcsec", lambda row: _pair(row, "median_arcsec", "p99_arcsec")),
-    ("about", lambda row: _pair(row, "roll_median_arcsec", "roll_p99_arcsec")),
+    ("across, 99 % ″", _numbers(0, "median_arcsec", "p99_arcsec")),
+    ("about, 99 % ″", _numbers(0, "roll_median_arcsec", "roll_p99_arcsec")),
     ("chi2", _number("normalised_squared_error", 2)),
     ("stars", _number("matched_median", 0)),
-    ("detect ms", _number("detect_ms", 2)),
-    ("identify ms", _number("identify_ms", 2)),
+    ("detect, identify ms", _numbers(2, "detect_ms", "identify_ms")),
 )
-
-
-def _pair(row: dict[str, Any], first: str, second: str) -> str:
-    return "" if row[first] is None else f"{row[first]:.0f}, {row[second]:.0f}"
 
 
 group = typer.Typer(
@@ -401,9 +402,20 @@ def algorithms(
     if as_json:
         print(json.dumps(rows))
     else:
-        print_table(_ALGORITHM_COLUMNS, rows)
+        for name, group in itertools.groupby(rows, key=lambda row: row["scene"]):
+            _print_algorithms(name, list(group))
     if any(row["wrong"] for row in rows if row["algorithm"] != "thesis"):
         raise typer.Exit(1)
+
+
+def _print_algorithms(scene: str, rows: list[dict[str, Any]]) -> None:
+    """Print the figures of a scene, with a column for each algorithm."""
+
+    def column(row: dict[str, Any]) -> Column:
+        return row["algorithm"], lambda figure: figure[1](row)
+
+    print(scene)
+    print_table([("", lambda figure: figure[0]), *map(column, rows)], _ALGORITHM_FIGURES)
 
 
 @group.command("orbit")

@@ -17,6 +17,8 @@ import pytest
 import typer
 from rich.console import Console
 
+from starhil.emulator.benchmarks import algorithms
+from starhil.emulator.benchmarks.algorithms import ALGORITHMS
 from starhil.emulator.cli import app, output
 from starid.cli import app as library
 from starid.cli import command_line
@@ -265,3 +267,33 @@ def test_a_command_that_compiles_kernels_says_so(words: str, monkeypatch: pytest
 
     monkeypatch.setattr(output, "compiling_reported", reported)
     assert run_command_line(*words.split()) == (2, "", "starhil: what it compiles is reported\n")
+
+
+def test_the_figures_of_the_algorithms_fit_into_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a column for each figure, a line had 255 characters."""
+    names = ["valid_pct", "right_pct", "within_pct", "across_deg", "about_deg", "stated_deg"]
+    names += [
+        "normalised_squared_error",
+        "true_kept_pct",
+        "false_kept_pct",
+        "median_ms",
+        "p99_ms",
+        "kilobytes",
+    ]
+    some = dict.fromkeys(names, 100.12345) | dict.fromkeys(("frames", "wrong", "in_region", "triggers"), 7)
+    errors = ("valid_error_pct", "right_error_pct", "within_error_pct", "normalised_squared_error_error")
+    rows = [
+        {"scene": f"{scene} deg/s", "algorithm": algorithm, **some, **dict.fromkeys(errors, error)}
+        for scene, error in (("0", 0.04), ("2", None))
+        for algorithm in ALGORITHMS
+    ]
+    rows[0]["across_deg"] = rows[0]["about_deg"] = None
+    monkeypatch.setattr(algorithms, "run_algorithms", lambda *_arguments: rows)
+    status, out, _ = run_command_line("campaign", "algorithms")
+    assert status == 1  # 7 refined attitudes are wrong
+    assert max(map(len, out.splitlines())) <= 110
+    shown = [re.split(r" {3,}", line.strip()) for line in out.splitlines() if line.strip()]
+    assert ["valid, %", *["100.1 ± 0.0"] * 3] in shown
+    assert ["valid, %", *["100.1"] * 3] in shown
+    assert ["kept of true, false stars, %", *["100, 100"] * 3] in shown
+    assert ["median error across, about, °", *["100.1235, 100.1235"] * 2] in shown
