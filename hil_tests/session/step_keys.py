@@ -16,7 +16,7 @@ from starhil.hil_tests.client.raw_traffic import parse_frame, pattern
 from starhil.hil_tests.judge.links import BusName
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.errors import OneLineError, did_you_mean
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd import InterfaceDefinition, UnknownNameError
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.icd.values import Parameter
 from starhil.protocol.serial.stack import dialects_of
@@ -31,8 +31,11 @@ def _read_by(read: Callable[[str, InterfaceDefinition], Any]) -> PlainValidator:
     def validate(value: Any, info: ValidationInfo) -> Any:
         if not isinstance(value, str):
             raise ValueError("must be a text")  # noqa: TRY004 -- for pydantic
+        icd: InterfaceDefinition = (info.context or {})["icd"]
         try:
-            return read(value, (info.context or {})["icd"])
+            return read(value, icd)
+        except UnknownNameError as error:
+            raise ValueError(f"unit {icd.name}: {error}") from None
         except OneLineError as error:
             raise ValueError(str(error)) from None
 

@@ -39,7 +39,7 @@ class Names(dict[str, _Item]):
 
     def __missing__(self, name: str) -> _Item:
         __tracebackhide__ = True  # pytest shows the caller's line instead
-        listed = "; `starhil icd list` lists all"
+        listed = "; `starhil icd list --unit UNIT` lists all"
         hint = remedy(name, self) if self._few else did_you_mean(name, self) or listed
         raise UnknownNameError(f"no {self._what} named {name!r}{hint}")
 

@@ -205,7 +205,7 @@ def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
         (
             "[[step]]\nread = 'quaternoin'\n",
             ["--start"],
-            "wrong.toml: step 1: read: no telemetry row named 'quaternoin'",
+            "wrong.toml: step 1: read: unit cubestar: no telemetry row named 'quaternoin'",
         ),
         (
             "[[step]]\nwait_s = 0\n[[step]]\ncontrol = 'clear_faults'\n",

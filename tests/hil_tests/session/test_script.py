@@ -205,6 +205,14 @@ def test_an_answer_that_no_dialect_of_the_unit_has_is_reported(unit, answer, mes
         load_script(path, load_unit(unit))
 
 
+@pytest.mark.parametrize("unit", ["sagitta", "cubestar"])
+def test_a_name_that_a_unit_lacks_is_reported_with_the_unit_as_it_may_be_the_wrong_one(unit, tmp_path):
+    path = tmp_path / "trial.toml"
+    path.write_text(f"[[step]]\nread = '{'solution' if unit == 'cubestar' else 'rates'}'")
+    with pytest.raises(ScriptError, match=f"step 1: read: unit {unit}: no telemetry row named"):
+        load_script(path, load_unit(unit))
+
+
 def test_a_refusal_is_named_by_the_errors_of_the_unit(tmp_path):
     path = tmp_path / "trial.toml"
     errors = "\n[errors]\nok = 0\nother = 9\n"

@@ -361,7 +361,7 @@ def test_unknown_names_offer_near_ones() -> None:
     with pytest.raises(UnknownNameError, match="did you mean quaternion") as caught:
         ICD.telemetry["quaternio"]
     assert str(caught.value).startswith("no telemetry row named 'quaternio'")
-    with pytest.raises(UnknownNameError, match="icd list"):
+    with pytest.raises(UnknownNameError, match="icd list --unit UNIT"):
         ICD.parameters["zzz"]
 
 
