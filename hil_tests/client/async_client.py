@@ -225,13 +225,13 @@ class AsyncObcClient:
                 answer = await self._attempt(request, limit)
                 whole = answer is not None and not self._is_incomplete(answer[0])
                 self._understood = self._understood or whole
-                if not self._understood and (dialect := self.link.dialect_of_reply(request)):
-                    raise BadReplyError(
-                        f"{name}: the unit replies in dialect {dialect}; choose it: --dialect {dialect}"
-                    )
-                if answer is not None and (whole or not left):
+                dialect = None if self._understood else self.link.dialect_of_reply(request)
+                if answer is not None and dialect is None and (whole or not left):
                     return self._checked_reply(name, *answer)
                 self.transactions.append(Transaction(name, "no_reply", float("inf")))
+                if dialect is not None:
+                    remedy = "choose it with --dialect, in pytest --starhil-dialect"
+                    raise BadReplyError(f"{name}: the unit replies in dialect {dialect}; {remedy}")
         self.link.check()
         raise NoReplyError(name, limit, attempts)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from starhil.protocol.errors import IcdError, did_you_mean
+from starhil.protocol.errors import IcdError, did_you_mean, remedy
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.codec import Field, Row
 from starhil.protocol.icd.device_model import ActionModel, ArgumentModel, DeviceModel, QuantityModel, generic
@@ -121,7 +121,7 @@ def _check_argument(field: Field, row: Row, action: ActionModel | None, model: D
         names = [*field.enum.values, *field.aliases]
         wrong = [item for item in names if item not in model.enums[argument.enum].values]
         if wrong:
-            hint = did_you_mean(wrong[0], model.enums[argument.enum].values)
+            hint = remedy(wrong[0], model.enums[argument.enum].values)
             raise IcdError(f"{wrong[0]!r} is not a value of argument {name}{hint}")
 
 

@@ -471,7 +471,7 @@ def test_a_step_that_fails_because_the_unit_replies_in_another_dialect_names_it(
     path.write_text("[[step]]\nread = 'device_status'\nwithin_s = 0.1\nevery_s = 0.01\n")
     with Rig(LinkOptions(serial=device.open_serial()), ICD) as rig:
         (result,) = run_steps(load_script(path, ICD), rig, tmp_path).results
-    assert "device_status: the unit replies in dialect a; choose it: --dialect a" in result.detail
+    assert "device_status: the unit replies in dialect a; choose it with --dialect, " in result.detail
 
 
 def test_a_session_that_resets_or_erases_needs_consent_for_a_unit_that_may_be_real(device, tmp_path):

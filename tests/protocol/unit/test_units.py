@@ -152,6 +152,7 @@ INVALID = [
     ("unknown argument", telecommand('{ name = "a", type = "u32", unit = "s", argument = "second" }', "set_clock"), "action set_clock has no argument 'second'; did you mean seconds"),
     ("missing argument", telecommand("", "set_mode"), "action set_mode needs the argument mode"),
     ("member of an argument", telecommand('{ name = "a", type = "u8", argument = "mode", map = { "1" = "trackin" } }', "set_mode"), "'trackin' is not a value of argument mode; did you mean tracking"),
+    ("member of an argument unlike any", telecommand('{ name = "a", type = "u8", argument = "mode", map = { "1" = "acquire" } }', "set_mode"), "'acquire' is not a value of argument mode; known: .*lost_in_space, standby, tracking"),
     ("unknown answer", telecommand("", more='answer = ["ack"]'), "unit.toml: telecommand command: answer 'ack': must be echo, reply or row:NAME"),
     ("field of a group without type", telemetry('{ repeat = { count = 2, fields = [{ name = "x" }] } }'), "telemetry row: field x: needs `type`"),
     ("answer with no such row", telecommand("", more='answer = ["row:stat"]') + telemetry('{ name = "a", type = "u8" }', "status"), "telecommand command: answer 'row:stat': no telemetry row named 'stat'; did you mean status"),
