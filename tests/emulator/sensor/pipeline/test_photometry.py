@@ -13,16 +13,19 @@ from starhil.emulator.sensor.pipeline.messages import FrameRequest
 from starhil.emulator.sensor.pipeline.photometry import _limit_of
 from starhil.emulator.truth.source import TruthState
 from starid.attitude import Attitude, propagate
+from tests.emulator.sensor.pipeline.known_photometry import LIMIT_AND_SIGMA, known_photometry
 
 pytestmark = pytest.mark.long
 
 
-@pytest.mark.parametrize(("profile", "low", "high"), [("cubestar", 3.25, 3.75), ("ideal", 5.5, 6.0)])
-def test_the_features_stop_where_the_detector_does_and_the_attitude_is_right(profile, low, high):
-    device = EcssDevice(EcssPlan(profile, ("run.algorithm=lsi",), 3))
+@pytest.mark.parametrize("profile", LIMIT_AND_SIGMA)
+def test_the_features_stop_where_the_detector_does_and_the_attitude_is_right(profile):
+    device = EcssDevice(EcssPlan(profile, ("run.algorithm=lsi", "identifier.refinement=true"), 3))
     request = next(iter(Comparison(AlgorithmPlan(profile, 1, 3))._images(Scene(0.0)))).request
     lsi = device.pipeline.identifier(request)
-    assert low <= lsi.options.detected_limit <= high
+    limit, sigma = LIMIT_AND_SIGMA[profile]
+    assert lsi.options.detected_limit == pytest.approx(limit, abs=0.01)
+    assert lsi.options.magnitude_sigma == pytest.approx(sigma, rel=0.02)
     assert lsi.database.parameters.kappa <= lsi.options.detected_limit
     sensor = device.pipeline._sensor
     assert lsi.zero_point == pytest.approx(2.5 * math.log10(sensor.zero_magnitude_e_s))
@@ -76,7 +79,7 @@ def test_the_limit_of_a_detector_that_finds_all_stars_is_that_of_the_stars():
 
 
 def test_false_stars_are_counted_among_the_detections_and_among_those_removed():
-    device = EcssDevice(EcssPlan("ideal", ("run.algorithm=rsi",), 3))
+    device = EcssDevice(EcssPlan("ideal", ("run.algorithm=rsi", *known_photometry("ideal")), 3))
     rate = np.radians([0.0, 0.5, 0.0])
     attitude = Attitude.from_radec_roll(83.8, -1.2, 0.0)
     results = []
