@@ -18,6 +18,7 @@ from starhil.emulator.benchmarks.ecss_campaign import EcssDevice, EcssPlan
 from starhil.emulator.sensor.pipeline.messages import FrameRequest
 from starhil.emulator.truth.source import TruthState
 from starid.attitude import propagate, random_attitude
+from tests.emulator.sensor.pipeline.known_photometry import known_photometry
 
 pytestmark = pytest.mark.long
 
@@ -32,7 +33,8 @@ LIKELY_RIGHT = 0.1
 
 @cache
 def device(profile: str) -> EcssDevice:
-    return EcssDevice(EcssPlan(profile, ("run.algorithm=rsi", "identifier.refinement=false")))
+    settings = ("run.algorithm=rsi", "identifier.refinement=false", *known_photometry(profile))
+    return EcssDevice(EcssPlan(profile, settings))
 
 
 @cache
