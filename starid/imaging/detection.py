@@ -178,6 +178,8 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
     fits = fit_candidates(Candidates(bare, peaks, heights, shape.sigma_px, shape.flow))
     if options.follow_trails and shape.trail_px == 0.0:
         fits, shape = _trails_or_spots(scene, len(peaks), hot, fits, shape, turning)
+    if options.gain_e_per_dn is None:
+        fits = fits.with_light_noise()
     return _stars_of(fits, shape, len(hot.xy))
 
 
@@ -268,7 +270,7 @@ def _stars_of(fits: Fits, shape: SpotShape, hot: int) -> Detections:
         stars[variance] *= np.where(is_bad, misfit, 1.0)
     doubt_close_pairs(stars, np.argsort(-stars["y"], kind="stable"), settings.blend_px)
     windows = fits.windows[good]
-    step = shift_by_edge(windows, fits.pixels, stars["flux"], background, settings.gain_e_per_dn)
+    step = shift_by_edge(windows, fits.pixels, stars["flux"], background, fits.sensor[0])
     uneven = square(step)
     stars["var_x"] += uneven
     stars["var_y"] += uneven

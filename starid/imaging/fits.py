@@ -1,11 +1,15 @@
 """Fits of single and double stars to the candidates of an image.
 
+The noise of starlight follows from the gain. Where that is not known, it is estimated from the fits: noise without it leaves
+them a χ² that grows with the light of a star, and states too small errors of bright stars.
+
 What is found with other values of a constant: `python tools/vary_constant.py imaging.fits._MISFIT_SIGMA 6`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -18,6 +22,7 @@ from starid.imaging.candidates import Candidates
 from starid.imaging.centroid import FIT, GOOD, NO_FIT
 from starid.imaging.measurement import (
     BAD_FIT,
+    FIRST_ROUND,
     FIRST_ROUNDS,
     FIT_PARAMETERS,
     NOT_A_STAR,
@@ -40,6 +45,18 @@ With 6, the squared errors of stars at rest are 2.24 times the stated ones inste
 _RELAXED_SHARE: Final = 0.8
 """Signal of a fitted star at least, as a share of the threshold: noise that made a peak higher is not in its fit. With 1, two
 of 9505 stars are lost, with 0.6 one is won, and four more are false."""
+
+_STARS_FOR_NOISE: Final = 50
+"""Number of stars, brightest first, from which the noise of starlight is estimated."""
+
+_LEAST_FOR_NOISE: Final = 4
+"""Number of them at least: fewer may all be unresolved pairs."""
+
+_LEAST_RATIO: Final = 3.0
+"""Signal-to-noise ratio that the light of a typical star is taken to have at least, by its own noise alone."""
+
+_NOISE_HALVINGS: Final = 9
+"""These leave 5 % of the estimate, less than its error from so few stars."""
 
 _MAX_NEIGHBOURS: Final = 64
 """Room for the neighbours of a candidate, on average; with 16 or 128 the same stars are found."""
@@ -92,6 +109,51 @@ class Fits:
         good = self.stars[self.stars["state"] == GOOD]
         misfit = np.count_nonzero(misfits(good)[1]) + np.count_nonzero(self.stars["state"] == NOT_A_STAR)
         return bool(misfit >= max(_MISFITS_FOR_TRAILS, _MISFIT_SHARE * len(good)))
+
+    def with_light_noise(self) -> Fits:
+        """Fit again with the variance of light that explains the χ² of the brightest stars.
+
+        It is the variance, in counts² per count, with which stars of half of their light have more than the mean of χ², and those of
+        the other half less: a few bright stars of another shape do not count for more than their light. A star that is none with
+        other weights keeps its fit.
+        """
+        good = self.stars["state"] == GOOD
+        used = np.flatnonzero(good & ((self.flags & SATURATED) == 0))
+        used = used[np.argsort(-self.stars["flux"][used], kind="stable")][:_STARS_FOR_NOISE]
+        if used.size < _LEAST_FOR_NOISE:
+            return self
+        flux = self.stars["flux"][used]
+        todo = np.zeros(len(self.stars), dtype=bool)
+        todo[used] = True
+
+        def is_more(variance: float) -> bool:
+            tried = self._with_variance(variance)
+            tried.measure(todo, FIRST_ROUND)
+            stars = tried.stars[used]
+            excess = np.where(stars["state"] == GOOD, stars["chi2"] - stars["pixels"] + FIT_PARAMETERS, 0.0)
+            return bool(np.sum(flux * np.sign(excess)) > 0.0)
+
+        # from the noise of one pixel for all light of a star, which does not show
+        typical = float(np.median(flux))
+        low, high = (
+            square(float(np.median(self.windows["noise"][used]))) / typical,
+            typical / square(_LEAST_RATIO),
+        )
+        if not is_more(low):
+            return self
+        for _ in range(_NOISE_HALVINGS):
+            middle = math.sqrt(low * high)
+            low, high = (middle, high) if is_more(middle) else (low, middle)
+        fits = self._with_variance(math.sqrt(low * high))
+        fits.measure(good, FIRST_ROUNDS)
+        lost = good & (fits.stars["state"] != GOOD)
+        fits.stars[lost] = self.stars[lost]
+        return fits
+
+    def _with_variance(self, light_variance: float) -> Fits:
+        """Return the fits with another variance of light, to be measured again."""
+        sensor = (light_variance, *self.sensor[1:])
+        return dataclasses.replace(self, sensor=sensor, stars=self.stars.copy(), flags=self.flags.copy())
 
     def with_companions(self) -> Fits:
         """Fit bad candidates as pairs and add their companions."""

@@ -31,8 +31,9 @@ SATURATED, AT_EDGE = 1, 2
 """Bits of a star's flags."""
 
 FIRST_ROUNDS: Final = (0, 3)
+FIRST_ROUND: Final = (0, 1)
 REFIT_ROUNDS: Final = (1, 4)
-"""First and last round of `measure`: starting from the candidates, or from existing fits."""
+"""First and last round of `measure`: starting from the candidates, the first of these alone, or from existing fits."""
 
 NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 5, 6, 7, 8
 """Reasons to reject a candidate, in addition to those of `starid.imaging.centroid`."""

@@ -24,7 +24,7 @@ class DetectionSettings:
     psf_growth : float
         Growth of the spot, relative to that in the centre, up to the middle of an edge; twice as much in the corners.
     gain_e_per_dn : float or None
-        Electrons per count; if given, errors include shot noise and fluxes are in electrons.
+        Electrons per count; if given, fluxes are in electrons. Otherwise the noise of starlight is estimated from the stars.
     saturation_dn : int or None
         Smallest count of a saturated pixel; if None, the largest value of the image type.
     model_error : float

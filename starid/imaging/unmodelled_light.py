@@ -38,19 +38,18 @@ def shift_by_edge(
     pixels: Array32,
     flux: Array,
     background: Background,
-    gain_e_per_dn: float | None,
+    light_variance: float,
 ) -> Array:
     """Return how far (n,) an edge in the background may have shifted the fits of stars, pixels.
 
-    Their windows (n,) lie in `pixels`, above the sky; the flux (n,) is in counts. An edge, as of a body in front of the sky, is
-    not noise: all pixels on one side of it pull the same way. A step of height h through the middle of a spot shifts its fit by
-    ``h ∫ M_x θ / (F ∫ M_x²)``, with the shape M and the flux F of the star: by 8 π σ³ h / (√(2π) F) for a round one, and by
-    2 π σ² L h / F along a trail of length L. There is a step where some pixels of the window are darker than any sky, or where
-    the ring around it varies more than noise and the light of the background explain.
+    Their windows (n,) lie in `pixels`, above the sky; the flux (n,) is in counts, the variance of light in counts² per count. An
+    edge, as of a body in front of the sky, is not noise: all pixels on one side of it pull the same way. A step of height h through
+    the middle of a spot shifts its fit by ``h ∫ M_x θ / (F ∫ M_x²)``, with the shape M and the flux F of the star: by
+    8 π σ³ h / (√(2π) F) for a round one, and by 2 π σ² L h / F along a trail of length L. There is a step where some pixels of the
+    window are darker than any sky, or where the ring around it varies more than noise and the light of the background explain.
     """
     explained = np.full(len(windows), square(background.median_noise))
-    if gain_e_per_dn is not None:
-        explained += np.maximum(windows["base"] - background.median_level, 0.0) / gain_e_per_dn
+    explained += light_variance * np.maximum(windows["base"] - background.median_level, 0.0)
     rest = square(windows["noise"]) - explained
     step = _STEP_PER_SPREAD * np.sqrt(np.where(rest > explained, rest, 0.0))
     begins = windows["offset"]

@@ -16,11 +16,14 @@ from numpy.typing import ArrayLike
 
 from starid.arithmetic.arrays import Array, GreyImage
 from starid.camera import DEFAULT_CAMERA, Camera
+from starid.camera.calibration import Calibration
+from starid.camera.position_errors import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.identification.error_risk import flagged
 from starid.identification.geometric.answer import MIN_MATCHED
 from starid.identification.geometric.identifier import Identifier
+from starid.identification.geometric.refinement import PRIOR_FREEDOM
 from starid.identification.options import LARGEST_ERROR_DEG
 from starid.identification.solution import Reason, Solution
 from starid.imaging.detection import Detections, DetectionSettings, detect
@@ -213,6 +216,8 @@ def refine_solution(
 ) -> ImageSolution:
     """Estimate the lens from the matched stars, if there are enough, and refine the solution with it.
 
+    The uncertainty of the lens is part of that of the attitude.
+
     Parameters
     ----------
     solution : Solution
@@ -232,10 +237,12 @@ def refine_solution(
     detections = view.detections
     if view.mirrored:
         detections = dataclasses.replace(detections, xy_px=flipped(detections.xy_px, camera.width))
-    refined = solution.camera or camera
+    refined, lens = solution.camera or camera, None
     if solution.star_count >= _MIN_FOR_LENS:
         stars = Stars(detections.xy_px, detections.flux, detections.xy_sigma_px)
-        refined = _refined(stars, solution, refined, camera, identifier.catalog.aberrated(observer_velocity))
+        lens = _calibration(stars, solution, camera, identifier.catalog.aberrated(observer_velocity))
+    if lens is not None:
+        refined = lens.camera
     again = identifier.with_camera(refined).track(
         detections.xy_px,
         detections.flux,
@@ -243,23 +250,39 @@ def refine_solution(
         detections.xy_sigma_px,
         observer_velocity=observer_velocity,
     )
+    seen = identifier.stars.aberrated(observer_velocity)
     if again.valid:
+        if lens is not None:
+            again = _less_certain(again, detections, lens, seen)
         solution = dataclasses.replace(again, mode="lost_in_space", camera=refined)
     solution = flagged(solution, LARGEST_ERROR_DEG).timed(begin)
-    seen = identifier.stars.aberrated(observer_velocity)
     return ImageSolution(solution, detections, solution.camera or camera, seen, view.mirrored)
 
 
-def _refined(
-    stars: Stars, solution: Solution, camera: Camera, nominal: Camera, catalog: StarCatalog
-) -> Camera:
-    """Calibrate the camera on an identified image; return `camera` if that fails."""
+def _calibration(
+    stars: Stars, solution: Solution, camera: Camera, catalog: StarCatalog
+) -> Calibration | None:
+    """Calibrate the camera on an identified image; return None if that fails."""
     try:
-        outcome = calibrate_identified([stars], {0: solution}, nominal, catalog, models=IMAGE_MODELS)
+        outcome = calibrate_identified([stars], {0: solution}, camera, catalog, models=IMAGE_MODELS)
     except StaridError as error:
         _log.info("lens not calibrated: %s", error)
-        return camera
-    return outcome.calibration.camera
+        return None
+    return outcome.calibration
+
+
+def _less_certain(
+    solution: Solution, detections: Detections, lens: Calibration, seen: StarCatalog
+) -> Solution:
+    """Return the solution with the uncertainty of the lens in its covariance."""
+    used = solution.detection_index
+    xy_px, errors_px = detections.xy_px[used], detections.position_errors[used]
+    directions = seen.vectors[seen.index_of(solution.hip)]
+    predicted_px, _ = lens.camera.project(solution.attitude.to_sensor(directions))
+    covariance, noise_px = attitude_covariance(
+        lens.camera, lens.covariance, xy_px, errors_px, xy_px - predicted_px, PRIOR_FREEDOM
+    )
+    return dataclasses.replace(solution, covariance=covariance, sigma_px=noise_px)
 
 
 def flipped(xy: Array, width: int) -> Array:

@@ -291,7 +291,7 @@ def test_stars_of_the_catalogue_in_one_spot_are_not_called_a_planet(tmp_path):
         "--ra",
         "84",
         "--dec",
-        "-1",
+        "-5",
         "--fov",
         "20",
         "--size",

@@ -128,6 +128,42 @@ def test_errors_are_calibrated_and_reach_the_bound(flux: float) -> None:
     assert np.sqrt(np.mean(np.concatenate(stated) ** 2)) == pytest.approx(bound, rel=0.12)
 
 
+@pytest.mark.parametrize("contrast", [1.0, 100.0])
+def test_without_the_gain_the_noise_of_light_is_estimated_from_the_stars(contrast: float) -> None:
+    """Positions, their errors and the scatter of the flux are those of a known gain, with stars of equal or different brightness."""
+    shape = (400, 400)
+    places = scattered(60, shape, 4, gap=16.0)
+    fluxes = np.geomspace(40000.0, 40000.0 / contrast, len(places))
+    squares, widths = [], []
+    for seed in range(6):
+        image = photograph(spots(shape, places, fluxes), seed)
+        found = detect(image, DetectionSettings(psf_sigma_px=SIGMA, model_error=0.0))
+        known = detect(image, DetectionSettings(psf_sigma_px=SIGMA, model_error=0.0, gain_e_per_dn=GAIN))
+        number, spurious = matched(found, places)
+        assert np.all(number >= 0)
+        assert len(spurious) == 0
+        squares.append(((found.xy_px[number] - places) / found.xy_sigma_px[number]) ** 2)
+        widths.append(found.sigma_px[number] / known.sigma_px[matched(known, places)[0]])
+    assert np.mean(squares) == pytest.approx(1.0, abs=3.0 * math.sqrt(2.0 / np.size(squares)) + 0.1)
+    brightest = np.array(squares)[:, :15]
+    assert brightest.mean() == pytest.approx(1.0, abs=3.0 * math.sqrt(2.0 / brightest.size) + 0.1)
+    assert np.mean(widths) == pytest.approx(1.0, abs=0.1)
+
+
+def test_some_bright_stars_of_another_shape_do_not_widen_the_errors_of_the_others() -> None:
+    shape = (400, 400)
+    places = scattered(60, shape, 4, gap=16.0)
+    fluxes = np.where(np.arange(60) < 10, 40000.0, 20000.0)
+    image = photograph(spots(shape, places, fluxes, np.where(np.arange(60) < 10, 1.2, SIGMA)))
+    found, known = (
+        detect(image, DetectionSettings(psf_sigma_px=SIGMA, model_error=0.0, gain_e_per_dn=gain))
+        for gain in (None, GAIN)
+    )
+    ordinary = places[10:]
+    ratio = found.sigma_px[matched(found, ordinary)[0]] / known.sigma_px[matched(known, ordinary)[0]]
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.25)
+
+
 def test_no_pixel_phase_error() -> None:
     """Bright stars on a grid of sub-pixel positions: the error has no systematic part."""
     shape = (420, 420)
