@@ -89,6 +89,8 @@ class CaseOptions:
         serial, can = links_to_use(bench.serial, bench.can, everything)
         if self.canopen is not None and can is None:
             raise BenchError("--canopen needs --can: give the channel of the node")
+        if serial is None and can is None and bench.start:
+            raise BenchError("no link: the emulator needs --serial auto or --can auto")
         if serial is None and can is None:
             raise BenchError("no link: use --serial DEV, --can CHANNEL, --canopen NODE, or --start")
         settings = with_orbit(self.settings, self.orbit)

@@ -8,12 +8,13 @@ import json
 import logging
 import resource
 import shlex
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -23,6 +24,7 @@ from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import Jobs, names_of
 from starhil.emulator.cli.output import compiles
 from starhil.emulator.errors import EmulatorError
+from starhil.hil_tests.rig.interruption import Interrupted, interruptible
 from starhil.protocol.files.bundled import bundled_units
 from starid.cli.options import AsJson
 from starid.cli.output import progress_shown
@@ -107,16 +109,30 @@ def command(
             script, again = replace(script, unit=unit), f"{again} --unit {shlex.quote(unit)}"
         else:
             check_runs_no_code(script.unit, f"--life {life}")
-        outcomes = [{**live(script, output), "repeat": again}]
+        outcomes, interruption = [{**live(script, output), "repeat": again}], None
     else:
-        outcomes = list(_run(plan, output))
+        outcomes, interruption = _ended_lives(_run(plan, output))
     figures = {"seed": plan.seed, **summary(outcomes)}
     if as_json:
         print(json.dumps({**figures, "violations": [item for item in outcomes if item["violation"]]}))
     else:
         _print(figures, outcomes)
+    if interruption is not None:
+        print(f"endurance: {interruption.reason}; lives that had not ended are not counted", file=sys.stderr)
+        raise typer.Exit(interruption.exit_status)
     if any(item["violation"] for item in outcomes):
         raise typer.Exit(1)
+
+
+def _ended_lives(running: Iterator[dict[str, Any]]) -> tuple[list[dict[str, Any]], Interrupted | None]:
+    """Collect the outcomes of lives until all have ended, or a signal interrupts them."""
+    outcomes: list[dict[str, Any]] = []
+    try:
+        with interruptible():
+            outcomes.extend(running)
+    except Interrupted as interruption:
+        return outcomes, interruption
+    return outcomes, None
 
 
 def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
@@ -145,7 +161,12 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
                 running.add(pool.submit(live_from_seed, *item, folder))
             if not running:
                 return
-            ended, running = wait(running, return_when=FIRST_COMPLETED)
+            try:
+                ended, running = wait(running, return_when=FIRST_COMPLETED)
+            except Interrupted:  # the pool would wait for lives that have begun
+                for process in active_children():
+                    process.terminate()
+                raise
             done += len(ended)
             if limit_s is None:
                 show(done, plan.lives)

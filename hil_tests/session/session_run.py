@@ -296,6 +296,8 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
     )
     serial, can = links_to_use(request.options.serial, request.options.can, by_default)
     if serial is None and can is None:
+        if request.start:
+            raise BenchError("no link: the emulator needs --serial auto or --can auto")
         raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
     options = replace(request.options, serial=serial, can=can)
     if not request.start and options.serial == "auto":

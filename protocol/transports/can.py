@@ -109,7 +109,7 @@ def _enlarge_receive_buffer(kernel_socket: socket.socket) -> None:
 
 def _check_kernel(channel: str) -> None:
     """Raise OSError with the reason and the remedy if a kernel interface is not available."""
-    remedy = "name another, or use auto, which falls back to the TCP hub"
+    remedy = "name another; for an emulator, auto falls back to the TCP hub"
     try:
         socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     except (OSError, AttributeError):

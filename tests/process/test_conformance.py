@@ -132,6 +132,7 @@ def test_the_attitude_of_a_running_unit_is_compared_with_its_truth_log_or_a_stat
     ("words", "message"),
     [
         ([], "no link: use"),
+        (["--start", "--serial", "off", "--can", "off"], "no link: the emulator needs"),
         (["nothing.such", "--serial", "/dev/null"], "no conformance case matches 'nothing.such'"),
         (["--serial", "/dev/no-such-tty"], "/dev/no-such-tty"),
         (["--serial", "auto"], "needs --start"),

@@ -4,12 +4,16 @@ import asyncio
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from itertools import chain, pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import AsyncMock
 
 import pytest
@@ -40,6 +44,7 @@ from starhil.protocol.icd.codec import Row
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
 from tests.planted import PlantedDefect, read_defects
+from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.long
 
@@ -355,6 +360,28 @@ def test_the_printed_command_repeats_the_life(kind, monkeypatch, tmp_path):
     first, again = lives
     assert first == again
     assert (len(first.steps) == 37, first.rendered) == (kind == "usual", kind == "rendered")
+
+
+def test_an_interrupted_run_prints_the_lives_that_have_ended(monkeypatch):
+    """As by Ctrl-C; the second life, which has begun, would take a minute."""
+    here = os.getpid()
+    ended = live_from_seed("nos3", 1, 1, "usual", Path("unused"))
+
+    def second_life_is_interrupted(_unit, seed, *_):
+        if seed > 1:
+            os.kill(here, signal.SIGTERM)
+            interrupted.wait(PATIENCE_S)
+        return ended
+
+    interrupted = threading.Event()
+    monkeypatch.setattr(endurance, "ProcessPoolExecutor", lambda jobs, **_: ThreadPoolExecutor(jobs))
+    monkeypatch.setattr(endurance, "active_children", lambda: [SimpleNamespace(terminate=interrupted.set)])
+    monkeypatch.setattr(endurance, "live_from_seed", second_life_is_interrupted)
+    status, said, errors = run_command_line("endurance", "--unit", "nos3", "--lives", "9", "--json")
+    assert interrupted.is_set()
+    assert status == 128 + signal.SIGTERM
+    assert json.loads(said)["lives"] == 1
+    assert errors == "endurance: interrupted by SIGTERM; lives that had not ended are not counted\n"
 
 
 def test_a_life_in_a_file_is_repeated_as_it_was(tmp_path, monkeypatch):

@@ -673,6 +673,10 @@ def test_listening_where_no_row_comes_without_a_request_is_rejected_before_the_f
     [
         (["nothing"], "session 'nothing': not found"),
         (["first_light"], "no link: use"),
+        (
+            ["first_light", "--start", "--serial", "off"],
+            "no link: the emulator needs --serial auto or --can auto",
+        ),
         (["first_light", "--serial", "auto"], "needs --start"),
         (["first_light", "--serial", "/dev/ttyS77", "--dialect", "d"], "must be a, b or c"),
     ],
