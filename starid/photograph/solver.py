@@ -276,7 +276,7 @@ def _less_certain(
 ) -> Solution:
     """Return the solution with the uncertainty of the lens in its covariance."""
     used = solution.detection_index
-    xy_px, errors_px = detections.xy_px[used], detections.position_errors[used]
+    xy_px, errors_px = detections.xy_px[used], detections.xy_sigma_px[used]
     directions = seen.vectors[seen.index_of(solution.hip)]
     predicted_px, _ = lens.camera.project(solution.attitude.to_sensor(directions))
     covariance, noise_px = attitude_covariance(
