@@ -259,6 +259,13 @@ def _advice(result: ImageSolution, fov: str | None, model: str, time_limit_s: fl
     if solution.reason == "too_few_stars":
         problem = detections.reason or f"only {len(detections)} stars detected"
         return f"{problem}; expose longer, or crop the image to the sky"
+    if solution.reason == "uncertain":
+        from starid.identification.options import LARGEST_ERROR_DEG
+
+        return (
+            f"the identified stars do not exclude an error above {LARGEST_ERROR_DEG:g}°; use an image with more stars, "
+            "or one that is not edited"
+        )
     advice = _advice_on_camera(fov, model)
     return advice if result.complete else f"given up after {time_limit_s:g} s (--time-limit); {advice}"
 

@@ -17,6 +17,7 @@ from starid.errors import StaridError
 from starid.identification.solution import Reason, Solution
 from starid.identification.star_identifier import make_identifier
 from starid.imaging.detection import detect
+from starid.photograph import solver
 
 pytestmark = pytest.mark.long
 
@@ -283,6 +284,20 @@ def test_a_bright_light_that_is_not_identified_is_explained(tmp_path):
     assert (light["x_px"], light["y_px"]) == pytest.approx((600.0, 300.0), abs=0.2)
     assert "a planet" in light["why"]
     assert "bright at (600, 300) px, not identified" in starid("identify", str(image)).output
+
+
+def test_the_advice_for_an_uncertain_attitude_is_not_about_the_field(tmp_path, monkeypatch):
+    image = tmp_path / "sky.png"
+    assert (
+        starhil(
+            "render", "--ra", "84", "--dec", "-5", "--fov", "20", "--size", "640x480", "-o", str(image)
+        ).exit_code
+        == 0
+    )
+    monkeypatch.setattr(solver, "LARGEST_ERROR_DEG", 1e-9)
+    fields = json.loads(starid("identify", str(image), "--json", "--fov", "20").stdout)
+    assert fields["reason"] == "uncertain"
+    assert fields["advice"].startswith("the identified stars do not exclude an error above 0.1°")
 
 
 def test_stars_of_the_catalogue_in_one_spot_are_not_called_a_planet(tmp_path):
