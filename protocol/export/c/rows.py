@@ -198,7 +198,8 @@ def _to_raw(field: Field, value: str) -> str:
 
 
 def _unscaled(field: Field, value: str) -> str:
-    return f"({value} - {_literal(field, field.bias)}) / {_literal(field, field.scale)}"
+    unbiased = f"({value} - {_literal(field, field.bias)})" if field.bias else value
+    return f"{unbiased} / {_literal(field, field.scale)}"
 
 
 # --- encoding and decoding ---
@@ -283,4 +284,5 @@ def _scaled(field: Field, raw: str) -> str:
         return raw
     divisor = field.divisor if field.kind != "float" else None
     factor = f"/ {_literal(field, float(divisor))}" if divisor else f"* {_literal(field, field.scale)}"
-    return f"(({'float' if is_single(field) else 'double'}){raw} {factor}) + {_literal(field, field.bias)}"
+    scaled = f"({'float' if is_single(field) else 'double'}){raw} {factor}"
+    return f"({scaled}) + {_literal(field, field.bias)}" if field.bias else scaled
