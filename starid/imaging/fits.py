@@ -52,8 +52,9 @@ _STARS_FOR_NOISE: Final = 50
 _LEAST_FOR_NOISE: Final = 4
 """Number of them at least: fewer may all be unresolved pairs."""
 
-_LEAST_RATIO: Final = 3.0
-"""Signal-to-noise ratio that the light of a typical star is taken to have at least, by its own noise alone."""
+_LEAST_RATIO: Final = 10.0
+"""Signal-to-noise ratio of a typical one of these stars at least, by the noise of its light alone. What explains less is not this noise:
+JPEG of quality 50, or many hot pixels, give 3 to 5."""
 
 _NOISE_HALVINGS: Final = 9
 """These leave 5 % of the estimate, less than its error from so few stars."""
@@ -114,8 +115,8 @@ class Fits:
         """Fit again with the variance of light that explains the χ² of the brightest stars.
 
         It is the variance, in counts² per count, with which stars of half of their light have more than the mean of χ², and those of
-        the other half less: a few bright stars of another shape do not count for more than their light. A star that is none with
-        other weights keeps its fit.
+        the other half less: a few bright stars of another shape do not count for more than their light. Compression and hot pixels
+        are not noise of light, and change nothing. A star that is none with other weights keeps its fit.
         """
         good = self.stars["state"] == GOOD
         used = np.flatnonzero(good & ((self.flags & SATURATED) == 0))
@@ -139,7 +140,7 @@ class Fits:
             square(float(np.median(self.windows["noise"][used]))) / typical,
             typical / square(_LEAST_RATIO),
         )
-        if not is_more(low):
+        if not is_more(low) or is_more(high):
             return self
         for _ in range(_NOISE_HALVINGS):
             middle = math.sqrt(low * high)

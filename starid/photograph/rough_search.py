@@ -23,7 +23,7 @@ from starid.errors import StaridError
 from starid.identification.geometric.identifier import Effort, Identifier, scaled_camera
 from starid.identification.options import UNLIMITED_DEG
 from starid.identification.solution import Reason, Solution
-from starid.photograph.typical_camera import typical_camera
+from starid.photograph.typical_camera import blend_in_typical, typical_camera
 
 SIZE_PX: Final = 1000.0
 """Side of the image for which the windows are defined; they scale with the side."""
@@ -118,13 +118,15 @@ class RoughSearch:
             )
         self._tolerance = fov_tolerance
         self._scale = max(math.sqrt(camera.width * camera.height) / SIZE_PX, 0.75)
+        typical = typical_camera(camera)
         self._first = Identifier(
             camera,
             catalog,
+            blend_px=blend_in_typical(camera, typical),
             fov_tolerance=fov_tolerance,
             largest_error_deg=UNLIMITED_DEG,
             effort=self._scaled(_LENIENT),
-            index_camera=typical_camera(camera),
+            index_camera=typical,
         )
 
     @property

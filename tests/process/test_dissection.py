@@ -84,7 +84,8 @@ def test_no_frame_of_sessions_with_a_canopen_node_is_malformed(tmp_path):
         with EmulatorProcess(command):
             talk_canopen(channel, tmp_path)
             for name in ("first_light", "errors"):
-                done = starhil("session", name, "--can", channel, "--assume-truth", "--log", tmp_path / name)
+                options = ("--can", channel, "--assume-truth", "--intrusive", "--log", tmp_path / name)
+                done = starhil("session", name, *options)
                 assert (done.returncode, done.stderr) == (0, ""), done.stdout
     frames = dissect(recording)
     assert len(frames) == sum(1 for _ in read_candump(recording)) > 1_000

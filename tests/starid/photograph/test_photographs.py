@@ -16,11 +16,12 @@ from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.identification.geometric.identifier import Identifier
 from starid.identification.geometric.pattern_stars import select_pattern_stars
+from starid.imaging.detection import DetectionSettings, detect
 from starid.photograph import field_sweep, solver
 from starid.photograph.field_sweep import FieldSweep, solve_any_field
 from starid.photograph.rough_search import CELLS, RoughSearch, distorted, even_selection
 from starid.photograph.solver import ImageSolution, solve_image
-from starid.photograph.typical_camera import typical_camera
+from starid.photograph.typical_camera import blend_in_typical, typical_camera
 from starid.photograph.views import View, correlation, has_dark_tail, views
 from tests.starid.photograph.night_sky import FOV_DEG, HEIGHT, WIDTH, photograph
 
@@ -142,6 +143,13 @@ def test_a_hopeless_search_ends_with_its_time_and_reports_its_progress(sky) -> N
     assert attempts == ["round 1 of 5, view 1, field 10° wide"]
 
 
+def test_what_compression_leaves_is_not_taken_for_noise_of_light(sky) -> None:
+    image, *_ = photograph(sky, 17001, quality=50)
+    found, noiseless = detect(image), detect(image, DetectionSettings(gain_e_per_dn=1e9))
+    assert len(found) == len(noiseless) > 20
+    assert found.xy_sigma_px == pytest.approx(noiseless.xy_sigma_px, rel=1e-3)
+
+
 def test_negative_and_mirrored_photographs_are_recognised(sky) -> None:
     image, truth, camera = photograph(sky, 6)
     negative = solve_image(np.invert(image), NOMINAL, sky, fov_tolerance=0.1)
@@ -213,6 +221,18 @@ def test_similar_cameras_share_an_index_with_pixels_no_finer_than_theirs() -> No
         assert typical is not None
         assert typical.pixel_scale_rad > camera.pixel_scale_rad
     assert typical_camera(Camera.from_fov(120.0, 1000, 1000)) is None
+
+
+@pytest.mark.parametrize("fov_deg", [19.0, 20.0, 21.0])
+def test_stars_that_the_image_shows_apart_are_not_merged_whatever_the_first_field(sky, fov_deg) -> None:
+    """26237 and 26268 are 2.2 pixels apart, 25044 and 25028 2.1; a typical camera has pixels 1.2 times as large."""
+    camera = Camera.from_fov(20.0, 640, 480)
+    search = RoughSearch(Camera.from_fov(fov_deg, 640, 480), sky, fov_tolerance=0.1)
+    assert {26237, 26268, 25044, 25028} <= set(search.identifier.stars.hip.tolist())
+    assert (
+        blend_in_typical(camera, typical_camera(camera)) * typical_camera(camera).pixel_scale_rad
+        <= 2.0 * camera.pixel_scale_rad * 1.01
+    )
 
 
 def test_an_even_selection_has_the_brightest_of_each_part() -> None:
