@@ -11,8 +11,9 @@ import shlex
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from multiprocessing import active_children, get_context
 from pathlib import Path
@@ -124,18 +125,20 @@ def command(
         raise typer.Exit(1)
 
 
-def _ended_lives(running: Iterator[dict[str, Any]]) -> tuple[list[dict[str, Any]], Interrupted | None]:
+def _ended_lives(
+    running: Generator[dict[str, Any], None, None],
+) -> tuple[list[dict[str, Any]], Interrupted | None]:
     """Collect the outcomes of lives until all have ended, or a signal interrupts them."""
     outcomes: list[dict[str, Any]] = []
     try:
-        with interruptible():
+        with interruptible(), closing(running):
             outcomes.extend(running)
     except Interrupted as interruption:
         return outcomes, interruption
     return outcomes, None
 
 
-def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
+def _run(plan: PlanOptions, folder: Path) -> Generator[dict[str, Any], None, None]:
     """Run the lives of a plan in processes, until its end or that of the time."""
     context = get_context("spawn")
     try:
@@ -155,25 +158,27 @@ def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
     ):
         running: set[Future[dict[str, Any]]] = set()
         done = 0
-        while True:
-            in_time = limit_s is None or time.monotonic() - begin < limit_s
-            while in_time and len(running) < 2 * plan.jobs and (item := next(lives, None)) is not None:
-                running.add(pool.submit(live_from_seed, *item, folder))
-            if not running:
-                return
-            try:
+        try:
+            while True:
+                in_time = limit_s is None or time.monotonic() - begin < limit_s
+                while in_time and len(running) < 2 * plan.jobs and (item := next(lives, None)) is not None:
+                    running.add(pool.submit(live_from_seed, *item, folder))
+                if not running:
+                    return
                 ended, running = wait(running, return_when=FIRST_COMPLETED)
-            except Interrupted:  # the pool would wait for lives that have begun
-                for process in active_children():
-                    process.terminate()
-                raise
-            done += len(ended)
-            if limit_s is None:
-                show(done, plan.lives)
-            else:
-                show(min(time.monotonic() - begin, limit_s), limit_s)
-            for future in ended:
-                yield future.result()
+                done += len(ended)
+                if limit_s is None:
+                    show(done, plan.lives)
+                else:
+                    show(min(time.monotonic() - begin, limit_s), limit_s)
+                for future in ended:
+                    yield future.result()
+        except (
+            BaseException
+        ):  # the pool would wait for lives that have begun; a signal also closes this generator
+            for process in active_children():
+                process.terminate()
+            raise
 
 
 def live_from_seed(unit: str, seed: int, steps: int, kind: str, folder: Path) -> dict[str, Any]:

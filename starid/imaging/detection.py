@@ -270,7 +270,7 @@ def _stars_of(fits: Fits, shape: SpotShape, hot: int) -> Detections:
         stars[variance] *= np.where(is_bad, misfit, 1.0)
     doubt_close_pairs(stars, np.argsort(-stars["y"], kind="stable"), settings.blend_px)
     windows = fits.windows[good]
-    step = shift_by_edge(windows, fits.pixels, stars["flux"], background, fits.sensor[0])
+    step = shift_by_edge(windows, fits.pixels, stars["flux"], background, fits.light_variance)
     uneven = square(step)
     stars["var_x"] += uneven
     stars["var_y"] += uneven

@@ -81,6 +81,11 @@ class Fits:
     stars: Records
     flags: npt.NDArray[np.uint8]
 
+    @property
+    def light_variance(self) -> float:
+        """Variance of a star's light, counts² per count."""
+        return self.sensor[0]
+
     def measure(self, todo: Mask, turns: tuple[int, int]) -> None:
         """Fit the candidates of a mask (n,) in the given rounds."""
         measure(

@@ -8,15 +8,13 @@ from typing import Final
 from starid.camera import Camera
 from starid.identification.geometric.index_choice import pixels_per_radian
 from starid.identification.geometric.pattern_index import field_solid_angle
+from starid.identification.options import GeometricOptions
 
 FIELD_STEP: Final = 1.2
 """Ratio of the widths of two adjacent typical fields."""
 
 WIDTHS_PX: Final = (500, 1000, 2000)
 """Sides of the typical images."""
-
-BLEND_PX: Final = 2.0
-"""Stars closer than this in an image, as in `starid.identification.options.GeometricOptions`, are one."""
 
 WIDEST_SR: Final = 1.5
 """Largest solid angle of a typical field; wider lenses differ too much and get an index each."""
@@ -41,10 +39,10 @@ def typical_camera(camera: Camera) -> Camera | None:
 def blend_in_typical(camera: Camera, typical: Camera | None) -> float:
     """Return the distance, in pixels of a typical camera, of stars that are one in a camera's image.
 
-    It is `BLEND_PX` of that camera, or down to a `FIELD_STEP` less, so that similar cameras share an index: in its own, coarser
-    pixels the typical camera would merge stars that the image shows apart.
+    It is `GeometricOptions.blend_px` of that camera's, or down to a `FIELD_STEP` less, so that similar cameras share an index:
+    in its own, coarser pixels the typical camera would merge stars that the image shows apart.
     """
     if typical is None:
-        return BLEND_PX
-    blend_px = BLEND_PX * pixels_per_radian(typical) / pixels_per_radian(camera)
+        return GeometricOptions.blend_px
+    blend_px = GeometricOptions.blend_px * pixels_per_radian(typical) / pixels_per_radian(camera)
     return FIELD_STEP ** math.floor(math.log(blend_px) / math.log(FIELD_STEP))

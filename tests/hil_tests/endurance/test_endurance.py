@@ -348,7 +348,8 @@ def test_the_printed_command_repeats_the_life(kind, monkeypatch, tmp_path):
     monkeypatch.setattr(endurance, "live", lambda life, folder: lives.append(life) or live(life, folder))
 
     def run_here(plan, folder):
-        return [live_from_seed(*item, folder) for item in plan.plan()]
+        for item in plan.plan():
+            yield live_from_seed(*item, folder)
 
     monkeypatch.setattr(endurance, "_run", run_here)
     periods = {f"--{name}": "1" if name == kind else "0" for name in ("rendered", "long")}
