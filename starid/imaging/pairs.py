@@ -338,7 +338,7 @@ def split_pairs(
     work = np.empty((5, side))
     cleaned = np.empty(largest, np.float32)
     left_over = np.empty(largest)
-    pair = np.empty_like(stars[:1].repeat(2))
+    pair = np.empty(2, stars.dtype)
     pair_count = 0
     for k in suspects:
         window: Window = windows[k]

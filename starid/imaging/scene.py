@@ -76,6 +76,8 @@ class DetectionSettings:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise StaridError(f"detection {name}: must be {low:g}…{high:g}, not {value!r}")
+            if value is not None and isinstance(low, float):
+                object.__setattr__(self, name, float(value))  # kernels are compiled for each type of argument
 
 
 @dataclass(frozen=True)

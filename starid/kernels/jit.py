@@ -48,3 +48,12 @@ def inner(function: Kernel) -> Kernel:
 def inner_checked(function: Kernel) -> Kernel:
     """Compile as `inner`, but division by zero raises an exception, as in `compiled`."""
     return cast("Kernel", njit(nogil=True, error_model="python")(function))
+
+
+def inlined(function: Kernel) -> Kernel:
+    """Merge a function, with IEEE 754 division, into the kernel that calls it, in place of compiling it.
+
+    Numba optimises each function together with all those that it calls: where few functions call each other in a row, those between are
+    compiled once more for each one above. Merging many makes the inference of types slow.
+    """
+    return cast("Kernel", njit(nogil=True, error_model="numpy", inline="always")(function))

@@ -42,7 +42,6 @@ from starhil.emulator.sensor.pipeline.messages import (
     camera_constants,
 )
 from starhil.emulator.sensor.pipeline.photometry import MeasuredPhotometry, measure_photometry
-from starhil.emulator.sensor.pipeline.precompile import start_helper
 from starhil.emulator.sensor.pipeline.preview import make_preview
 from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starhil.emulator.sensor.renderer import Frame, Renderer, frame_without_truth
@@ -94,11 +93,12 @@ _WARM_UP_RATES_RAD_S: Final = ((1e-4, 0.0, 0.0), (3e-3, 0.0, 0.0))
 """Rates at which stars in this exposure are round, or leave trails of a few pixels."""
 
 
-def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Failure:
-    """Make a pipeline and warm it up; on failure, return the reason in one line."""
+def make_pipeline(
+    setup: PipelineSetup, helper: subprocess.Popen[bytes] | None = None
+) -> tuple[Pipeline, PipelineReady] | Failure:
+    """Make a pipeline and warm it up, with a `helper` as in `Pipeline.warm_up`; on failure, return the reason in one line."""
     begin = time.perf_counter()
     try:
-        helper = start_helper()
         pipeline = Pipeline(setup)
         images = open_images(setup.images, pipeline.camera)
         if images is not None:

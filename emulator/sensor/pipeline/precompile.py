@@ -17,7 +17,12 @@ from starid.kernels.kernel_cache import nothing_compiled
 
 
 def start_helper() -> subprocess.Popen[bytes] | None:
-    """Start the process that compiles the star identifier, unless the cache has kernels; the caller must wait for it."""
+    """Start the process that compiles the star identifier, unless the cache has kernels; the caller must wait for it.
+
+    It is called before the first kernel, which would be found in the cache.
+    """
+    import starid.kernels.jit  # noqa: F401 (which chooses the folder of kernels)
+
     if not nothing_compiled():
         return None
     module = "starhil.emulator.sensor.pipeline.precompile"

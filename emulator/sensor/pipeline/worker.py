@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from starhil.emulator.errors import one_line
 from starhil.emulator.sensor.pipeline.messages import LENGTH, Failure, with_length
+from starhil.emulator.sensor.pipeline.precompile import start_helper
 from starhil.emulator.simulation.parent_death_signal import end_with_parent
 
 NICE: Final = 5
@@ -58,13 +59,14 @@ def serve_in_thread(link: socket.socket) -> None:
 def serve(link: socket.socket) -> None:
     """Receive the setup, then requests, until the emulator closes the socket."""
     gc.disable()  # until the pipeline is warm: imports make many objects and little garbage
+    helper = start_helper()
     call_first_kernel()
     from starhil.emulator.sensor.pipeline.pipeline import make_pipeline  # imported while the emulator starts
 
     setup = _receive(link)
     if setup is None:
         return
-    made = make_pipeline(setup)
+    made = make_pipeline(setup, helper)
     if isinstance(made, Failure):
         _send(link, made)
         return

@@ -24,7 +24,7 @@ from starid.identification.geometric.refinement import (
 )
 from starid.identification.geometric.settings import NOTHING, Settings
 from starid.identification.geometric.verification import log_false_probability, worth_refining
-from starid.kernels.jit import inner
+from starid.kernels.jit import inlined, inner
 
 MIN_MATCHED: Final = 4
 """Least number of matches for an answer without a predicted attitude."""
@@ -82,7 +82,7 @@ def new_candidate(count: int) -> Candidate:
     return Candidate(np.empty((3, 3, 3)), stars, np.empty((4, 4)), np.empty(NUMBERS))
 
 
-@inner
+@inlined
 def test_and_refine(
     index: IndexArrays,
     raw: Raw,

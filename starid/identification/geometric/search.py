@@ -48,7 +48,7 @@ from starid.identification.geometric.pattern_index import (
 from starid.identification.geometric.refinement import SCALE, ZERO_POINT
 from starid.identification.geometric.settings import ACCEPTED, NOTHING, TOO_FEW, Settings
 from starid.identification.geometric.verification import hit_odds, test_order
-from starid.kernels.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inlined, inner
 from starid.kernels.small_arrays import zero
 
 SYSTEMATIC: Final = 14
@@ -134,7 +134,7 @@ def set_rotation(star_table: Array, stars: tuple[int, int, int], frames: Array) 
             frames[2, i, j] = sensor[0, i] * sky[0, j] + sensor[1, i] * sky[1, j] + sensor[2, i] * sky[2, j]
 
 
-@inner
+@inlined
 def _try_patterns(
     index: IndexArrays,
     raw: Raw,

@@ -41,7 +41,7 @@ from starid.identification.geometric.search import set_rotation, set_sensor_tria
 from starid.identification.geometric.settings import ACCEPTED, NOTHING, TOO_FEW, Settings
 from starid.identification.geometric.sky_grid import cell_of
 from starid.identification.geometric.verification import hit_odds, test_order
-from starid.kernels.jit import compiled_ieee, inner
+from starid.kernels.jit import compiled_ieee, inlined, inner
 
 PAIRED_DETECTIONS: Final = 16
 """Number of detections, brightest first, that form pairs."""
@@ -106,7 +106,7 @@ def _keep_better(candidate: Candidate, bound: float, best: Candidate, bounds: Ar
         best.numbers[i] = candidate.numbers[i]
 
 
-@inner
+@inlined
 def _try_pair(
     index: IndexArrays,
     raw: Raw,
@@ -132,7 +132,7 @@ def _try_pair(
     return test_and_refine(index, raw, observed, settings, candidate, tests, (i, j, j), min_matched, prior)
 
 
-@inner
+@inlined
 def _try_detections(
     index: IndexArrays,
     raw: Raw,

@@ -39,7 +39,7 @@ class StandIn:
     setups: list[PipelineSetup] = field(default_factory=list)
     requests: list[IndexRequest] = field(default_factory=list)
 
-    def make(self, setup: PipelineSetup) -> tuple[StandIn, PipelineReady] | Failure:
+    def make(self, setup: PipelineSetup, _helper: object = None) -> tuple[StandIn, PipelineReady] | Failure:
         self.setups.append(setup)
         return self.failure or (self, PipelineReady(CAMERA, 5, 0.0))
 
@@ -188,7 +188,7 @@ def test_warming_the_cache_reports_its_progress(
         reported.set()
         return 7
 
-    def make(setup: PipelineSetup) -> tuple[StandIn, PipelineReady] | Failure:
+    def make(setup: PipelineSetup, _helper: object = None) -> tuple[StandIn, PipelineReady] | Failure:
         reported.wait(PATIENCE_S)
         return pipeline.make(setup)
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 import math
+import sys
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numba import njit
 from scipy.special import erf
 
 from starid.catalog.photometry import fitted_share
@@ -21,6 +23,7 @@ pytestmark = [pytest.mark.long, pytest.mark.lowest("numba")]
 SIGMA = 0.8
 SKY, NOISE, GAIN = 40.0, 3.0, 2.0
 KNOWN = DetectionSettings(gain_e_per_dn=GAIN)
+Kernel = type(njit(lambda: None))
 
 
 def spot(shape: tuple[int, int], x: float, y: float, flux: float, sigma: float = SIGMA) -> np.ndarray:
@@ -104,6 +107,38 @@ def test_stars_are_found_where_they_are(top: int) -> None:
     pull = (detections.flux[number] / GAIN - fluxes) / (detections.flux_sigma[number] / GAIN)
     assert abs(pull.mean()) < 0.7
     assert pull.std() == pytest.approx(1.0, abs=0.4)
+
+
+def test_whole_numbers_in_settings_call_the_same_kernels() -> None:
+    """A kernel is compiled, for seconds, for each combination of types of its arguments."""
+    whole = {
+        "threshold_sigma": 6,
+        "psf_sigma_px": 1,
+        "psf_growth": 0,
+        "gain_e_per_dn": 2,
+        "model_error": 0,
+        "blend_px": 2,
+        "pixel_sigma": 3,
+    }
+    shape = (200, 200)
+    image = photograph(spots(shape, scattered(8, shape, 2), 60_000.0, 1.0))
+    for flow in (False, True):
+        detect(
+            image,
+            DetectionSettings(**{name: float(value) for name, value in whole.items()}, follow_trails=flow),
+        )
+    before = _kernels()
+    for flow in (False, True):
+        assert len(detect(image, DetectionSettings(**whole, follow_trails=flow))) >= 8
+    assert _kernels() == before
+    assert any("measure" in name for name, _ in before)
+
+
+def _kernels() -> set[tuple[str, object]]:
+    """Name and types of arguments of each kernel that has been called."""
+    modules = [module for name, module in sys.modules.items() if name.startswith("starid.")]
+    kernels = [item for module in modules for item in vars(module).values() if isinstance(item, Kernel)]
+    return {(kernel.__name__, types) for kernel in kernels for types in kernel.signatures}
 
 
 @pytest.mark.parametrize("flux", [250.0, 1000.0, 8000.0, 60000.0])

@@ -44,7 +44,7 @@ def make_pipeline(request, worker, monkeypatch):
     """Make an imager that answers with numbered frames and can be killed."""
     monkeypatch.setattr(
         "starhil.emulator.sensor.pipeline.pipeline.make_pipeline",
-        lambda _setup: (FakePipeline(), PipelineReady({}, 5, 0.0)),
+        lambda _setup, _helper: (FakePipeline(), PipelineReady({}, 5, 0.0)),
     )
 
     def make():
@@ -193,7 +193,7 @@ def test_a_request_that_cannot_be_sent_is_not_left_pending(worker):
 
 
 def test_a_thread_whose_pipeline_cannot_be_made_reports_it(monkeypatch):
-    def fail(_setup):
+    def fail(_setup, _helper):
         raise ValueError("odd\ncamera")
 
     monkeypatch.setattr("starhil.emulator.sensor.pipeline.pipeline.make_pipeline", fail)
