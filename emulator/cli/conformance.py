@@ -79,7 +79,7 @@ class CaseOptions:
         from starhil.hil_tests.conformance.conformance_run import ConformanceRequest
         from starhil.hil_tests.conformance.link_probe import ProbeTimes
         from starhil.hil_tests.errors import BenchError
-        from starhil.hil_tests.rig.rig import OFF, links_to_use
+        from starhil.hil_tests.rig.rig import OFF, check_links, links_to_use
         from starhil.protocol.unit import load_unit
 
         icd, canopen = load_unit(bench.unit or DEFAULT_UNIT), self.canopen
@@ -89,10 +89,7 @@ class CaseOptions:
         serial, can = links_to_use(bench.serial, bench.can, everything)
         if self.canopen is not None and can is None:
             raise BenchError("--canopen needs --can: give the channel of the node")
-        if serial is None and can is None and bench.start:
-            raise BenchError("no link: the emulator needs --serial auto or --can auto")
-        if serial is None and can is None:
-            raise BenchError("no link: use --serial DEV, --can CHANNEL, --canopen NODE, or --start")
+        check_links(serial, can, "--serial DEV, --can CHANNEL, --canopen NODE", start=bench.start)
         settings = with_orbit(self.settings, self.orbit)
         if settings and not bench.start:
             option = "--set" if self.orbit is None else "--orbit"

@@ -41,6 +41,13 @@ def links_to_use(
     return None if serial == OFF else serial, None if can == OFF else can
 
 
+def check_links(serial: str | None, can: str | None, options: str, *, start: bool) -> None:
+    """Raise an error if no link is in use, naming the `options` that give one unless an emulator is started."""
+    if serial is None and can is None:
+        remedy = "the emulator needs --serial auto or --can auto" if start else f"use {options}, or --start"
+        raise BenchError(f"no link: {remedy}")
+
+
 @dataclass(frozen=True)
 class LinkOptions:
     """Options of the links and of the clients.

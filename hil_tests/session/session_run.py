@@ -21,7 +21,7 @@ from starhil.hil_tests.rig.console_feed import RunFeed, console_address
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, pointed
 from starhil.hil_tests.rig.interruption import Interrupted
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
-from starhil.hil_tests.rig.rig import LinkOptions, Rig, links_to_use
+from starhil.hil_tests.rig.rig import LinkOptions, Rig, check_links, links_to_use
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
 from starhil.hil_tests.rig.truth_log import TruthLogReader
 from starhil.hil_tests.session.expect import show_angle
@@ -295,10 +295,7 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
         "auto" if wanted in ("can", "both") else None,
     )
     serial, can = links_to_use(request.options.serial, request.options.can, by_default)
-    if serial is None and can is None:
-        if request.start:
-            raise BenchError("no link: the emulator needs --serial auto or --can auto")
-        raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
+    check_links(serial, can, "--serial DEV, --can CHANNEL, both", start=request.start)
     options = replace(request.options, serial=serial, can=can)
     if not request.start and options.serial == "auto":
         raise BenchError("--serial auto needs --start; otherwise name the port")

@@ -17,13 +17,12 @@ from numpy.typing import ArrayLike
 from starid.arithmetic.arrays import Array, GreyImage
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.camera.calibration import Calibration
-from starid.camera.position_errors import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.identification.error_risk import flagged
 from starid.identification.geometric.answer import MIN_MATCHED
 from starid.identification.geometric.identifier import Identifier
-from starid.identification.geometric.refinement import PRIOR_FREEDOM
+from starid.identification.lens_errors import with_lens_errors
 from starid.identification.options import LARGEST_ERROR_DEG
 from starid.identification.solution import Reason, Solution
 from starid.imaging.detection import Detections, DetectionSettings, detect
@@ -276,13 +275,13 @@ def _less_certain(
 ) -> Solution:
     """Return the solution with the uncertainty of the lens in its covariance."""
     used = solution.detection_index
-    xy_px, errors_px = detections.xy_px[used], detections.xy_sigma_px[used]
+    xy_px = detections.xy_px[used]
     directions = seen.vectors[seen.index_of(solution.hip)]
     predicted_px, _ = lens.camera.project(solution.attitude.to_sensor(directions))
-    covariance, noise_px = attitude_covariance(
-        lens.camera, lens.covariance, xy_px, errors_px, xy_px - predicted_px, PRIOR_FREEDOM
+    offsets = xy_px - predicted_px
+    return with_lens_errors(
+        solution, lens.camera, lens.covariance, xy_px, detections.xy_sigma_px[used], offsets
     )
-    return dataclasses.replace(solution, covariance=covariance, sigma_px=noise_px)
 
 
 def flipped(xy: Array, width: int) -> Array:

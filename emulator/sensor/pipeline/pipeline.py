@@ -53,7 +53,6 @@ from starid.arithmetic.elementary import log10
 from starid.arithmetic.matrices import length, lengths
 from starid.attitude import ARCSEC_PER_RAD, Attitude
 from starid.camera import Camera
-from starid.camera.position_errors import attitude_covariance
 from starid.catalog import StarCatalog, load_catalog
 from starid.catalog.aberration import aberrated
 from starid.errors import StaridError
@@ -61,7 +60,7 @@ from starid.identification.error_risk import flagged, largest_across_rad, reject
 from starid.identification.geometric.identifier import Effort
 from starid.identification.geometric.index_choice import pixels_per_radian
 from starid.identification.geometric.pattern_index import resolved_stars
-from starid.identification.geometric.refinement import PRIOR_FREEDOM
+from starid.identification.lens_errors import with_lens_errors
 from starid.identification.options import GeometricOptions
 from starid.identification.predicted_stars import Prediction, expected_places, solve_with_prediction
 from starid.identification.solution import Reason, Solution
@@ -373,13 +372,8 @@ class Pipeline:
             return rejected(solution, reason)
         if self._calibration is not None:
             camera, used = calibrated_camera(self.camera, settings), solution.detection_index
-            covariance, noise_px = attitude_covariance(
-                camera, self._calibration, xy[used], errors[used], offsets, PRIOR_FREEDOM
-            )
-            solution = flagged(
-                replace(solution, covariance=covariance, sigma_px=noise_px),
-                self._setup.device.largest_error_deg,
-            )
+            certain = with_lens_errors(solution, camera, self._calibration, xy[used], errors[used], offsets)
+            solution = flagged(certain, self._setup.device.largest_error_deg)
         return solution
 
     def _solve_or_follow(
