@@ -137,18 +137,19 @@ class _Datagrams:
             self._socket = None
 
     def _turn(self, source: socket.socket) -> None:
-        """Receive what has come, and process lines until none waits, a rest is due, or it takes long."""
+        """Receive what has come, and process lines until none waits or it takes long; then rest, if that is due."""
         loop, begin_s = asyncio.get_running_loop(), time.thread_time()
-        with self._account.taking(), contextlib.suppress(OSError):  # nothing more is there
-            while time.thread_time() < begin_s + TURN_S:
-                self.add(source.recv(LONGEST_DATAGRAM))
-        until_s = None
-        while self.waiting and until_s is None:
-            with self._account.taking():
+        with self._account.taking():
+            with contextlib.suppress(OSError):  # nothing more is there
+                while time.thread_time() < begin_s + TURN_S:
+                    self.add(source.recv(LONGEST_DATAGRAM))
+            while self.waiting:
                 self.process_line()
-            until_s = self._account.rests_until_s()
-            if until_s is None and time.thread_time() >= begin_s + 2.0 * TURN_S:
-                until_s = loop.time()
+                if time.thread_time() >= begin_s + 2.0 * TURN_S:
+                    break
+        until_s = self._account.rests_until_s()
+        if until_s is None and self.waiting:
+            until_s = loop.time()
         if until_s is not None:
             loop.remove_reader(source)
             self._rest = loop.call_at(until_s, self._end_rest, source)

@@ -132,7 +132,7 @@ LONG_LINES = (b'{"q":[' + b"1," * 900 + b"1]}\n") * MAX_LINES
 
 
 @pytest.mark.parametrize("datagram", [MESSAGE, LONG_LINES, b"", b"\n" * 60_000])
-def test_a_flood_of_datagrams_takes_short_turns_and_less_than_half_of_the_loop(
+def test_a_flood_of_datagrams_takes_short_turns_and_no_more_than_its_share_of_the_loop(
     datagram: bytes, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Messages without pause held up replies on the bus by 40 ms, and a datagram of 32 long lines by 8 ms."""
@@ -146,26 +146,27 @@ def test_a_flood_of_datagrams_takes_short_turns_and_less_than_half_of_the_loop(
 
     monkeypatch.setattr(_Datagrams, "_turn", timed)
 
+    def flood(peer: socket.socket) -> float:
+        begin_s = time.monotonic()
+        while time.monotonic() < begin_s + 0.5:
+            peer.send(datagram)
+        return time.monotonic() - begin_s
+
     async def main() -> float:
         feed = LiveFeed(truth := LiveTruth(Attitude.identity()), lambda: 1.0)
         address = await feed.start("udp", "127.0.0.1", 0)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
             peer.connect(("127.0.0.1", int(address.rpartition(":")[2])))
-            begin_s = time.monotonic()
-            while time.monotonic() < begin_s + 0.5:
-                for _ in range(100):
-                    peer.send(datagram)
-                await asyncio.sleep(0)
-            flooded_s = time.monotonic() - begin_s
+            flooded_s = await asyncio.to_thread(flood, peer)
+            share = sum(turns) / flooded_s
             await asyncio.sleep(0.3)
             before = truth.accepted
             peer.send(MESSAGE)
             await until(lambda: truth.accepted > before)
         feed.close()
-        return flooded_s
+        return share
 
-    flooded_s = asyncio.run(main())
-    assert sum(turns) < 0.5 * flooded_s
+    assert asyncio.run(main()) < 0.4  # of which 0.3 are free
     assert float(np.median(turns)) < 0.002
 
 
