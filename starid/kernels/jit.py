@@ -51,9 +51,9 @@ def inner_checked(function: Kernel) -> Kernel:
 
 
 def inlined(function: Kernel) -> Kernel:
-    """Merge a function, with IEEE 754 division, into the kernel that calls it, in place of compiling it.
+    """Merge a function, with IEEE 754 division, into the kernel that calls it, before types are inferred.
 
-    Numba optimises each function together with all those that it calls: where few functions call each other in a row, those between are
-    compiled once more for each one above. Merging many makes the inference of types slow.
+    Numba optimises each function with all that it calls, so that the last of a chain of functions is optimised once for each function
+    before it. To merge those in the middle saves that; to merge many costs more, because the inference of types slows down.
     """
     return cast("Kernel", njit(nogil=True, error_model="numpy", inline="always")(function))
