@@ -76,14 +76,15 @@ lane-vcan0:
 lane-%:
 	@env -u MAKEFLAGS $(PRIORITY) $(BIN)/python -m pytest -m "not socketcan" --junit-xml=$(REPORTS)/$*.xml $(TESTS)
 
-# files with a marker; pytest's own selection would import all others, too
-marked = $(shell grep -rl --include='test_*.py' 'pytest\.mark\.$(1)\b' tests)
+# files all of whose tests have a marker; pytest's own selection would import all others, too
+marked = $(shell grep -rl --include='test_*.py' 'pytestmark.*pytest\.mark\.$(1)\b' tests)
 # beside the tests that start processes, without those marked as long: they compute for seconds, or wait for the clock or a peer
 check: $(VENV)/.developer
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not process and not browser and not socketcan" $(addprefix --ignore=,$(call marked,long))
+	$(BIN)/python -m pytest -q -n auto --dist loadfile -m "not process and not browser and not socketcan and not long" \
+		$(addprefix --ignore=,$(call marked,long) $(call marked,process) $(call marked,browser))
 
 # what only tests need is of today; oem and others of the extra `test` need more than the lowest versions
 LOWEST_TOOLS := 'pytest>=8' 'hypothesis>=6.100' msgpack cantools canmatrix space_packet_parser dcf-tools durand spiceypy

@@ -119,6 +119,7 @@ def uses(file: Path) -> set[tuple[str, str]]:
     return {(path, name) for name in forbidden}
 
 
+@pytest.mark.long
 def test_telemetry_depends_on_no_function_that_differs_between_machines() -> None:
     files = [file for name in FOLDERS for file in sorted((ROOT / name).rglob("*.py"))]
     assert len(files) > 150

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 
+import pytest
 import serial
 from typer.testing import CliRunner
 
@@ -102,6 +103,7 @@ def test_the_framing_of_the_page_carries_every_message(tmp_path):
         assert received.feed(framing.encode(b"a" * size), 0.0) == [b"a" * size], size
 
 
+@pytest.mark.long
 def test_the_unit_of_the_page_streams_by_itself(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "starhil.emulator.run.run.make_pipeline", lambda *_, **__: FakeImager(FakePipeline().handle)

@@ -89,6 +89,7 @@ def test_an_emulator_that_dies_at_the_last_step_fails_the_session_and_its_report
     assert ET.parse(junit).getroot().get("failures") == "1"
 
 
+@pytest.mark.long
 def test_a_port_where_nothing_answers_ends_the_conformance_run_with_its_reports(tmp_path):
     junit, html = tmp_path / "c.xml", tmp_path / "c.html"
     master, slave = pty.openpty()

@@ -132,6 +132,7 @@ ONE = ("sin", "cos", "tan", "atan", "asin", "acos", "exp", "log", "log10", "squa
 TWO = ("hypot", "atan2", "power")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [*ONE, *TWO])
 def test_kernels_compute_the_same_bytes(name: str) -> None:
     function = getattr(elementary, name)

@@ -25,6 +25,7 @@ def test_each_survivor_with_a_reason_is_a_mutant_of_its_line(module):
     assert listed <= {(lines[line - 1], change) for _, line, change in mutants}
 
 
+@pytest.mark.long
 def test_every_change_can_be_made():
     path = ROOT / "protocol" / "serial" / "checks.py"
     source = ast.unparse(ast.parse(path.read_text("utf-8")))

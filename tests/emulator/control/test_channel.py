@@ -464,6 +464,7 @@ def test_a_scenario_of_which_one_event_is_impossible_changes_nothing(run, tmp_pa
     assert run(scenario)["faults"] == {}
 
 
+@pytest.mark.long
 def test_many_requests_in_one_write_leave_the_loop_to_the_links(run):
     """The peer reads in a thread: otherwise the answers that it has not read hold up the requests."""
 

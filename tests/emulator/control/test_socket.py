@@ -146,6 +146,7 @@ def test_a_path_that_cannot_be_is_rejected_in_one_line(run, path, said):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.long
 def test_requests_without_the_token_have_turns_and_those_with_it_do_not_wait(run, monkeypatch):
     """50 connections that sent long requests without the token held up replies on the bus by 130 ms."""
     count, peers, taken, answered = 20, 8, [], []

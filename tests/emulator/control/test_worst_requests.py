@@ -131,6 +131,7 @@ LONG_LINES = (b'{"q":[' + b"1," * 900 + b"1]}\n") * MAX_LINES
 """A datagram of 57 kB."""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("datagram", [MESSAGE, LONG_LINES, b"", b"\n" * 60_000])
 def test_a_flood_of_datagrams_takes_short_turns_and_no_more_than_its_share_of_the_loop(
     datagram: bytes, monkeypatch: pytest.MonkeyPatch

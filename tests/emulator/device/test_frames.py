@@ -115,6 +115,7 @@ def test_a_new_update_rate_holds_at_once(bench):
     assert bench.read("precise_attitude")["frame_counter"] >= 18
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("exposure", "rate"), [(100, 10.0), (30, 33.333332), (20, 50.0), (10, 100.0)])
 def test_the_highest_rate_that_an_exposure_leaves_is_reached(bench, exposure, rate):
     bench.command("set_parameter", parameter=1, value=exposure)

@@ -102,6 +102,7 @@ def test_a_rate_above_the_limit_is_flagged(make_bench):
     assert not bench.read("health")["rate_too_high"]
 
 
+@pytest.mark.long
 def test_particles_come_with_the_south_atlantic_anomaly(make_bench):
     orbit = {"kind": "kepler", "semi_major_axis_km": 6871.0, "inclination_deg": 97.4}
     profile = Profile.model_validate(

@@ -50,6 +50,7 @@ def rows(results):
     return [(result.index, result.index_pending, result.valid, result.matched) for result in results]
 
 
+@pytest.mark.long
 def test_it_is_the_same_on_the_real_and_on_the_stepped_clock(tmp_path):
     stepped = run(first_frames, tmp_path, clock="stepped")
     real = run(first_frames, tmp_path, clock="real")
@@ -57,6 +58,7 @@ def test_it_is_the_same_on_the_real_and_on_the_stepped_clock(tmp_path):
     assert [result.index_pending for result in real] == [False] * FRAMES
 
 
+@pytest.mark.long
 def test_it_is_solved_with_the_stored_parameters(tmp_path):
     async def save(emulation):
         emulation.device.parameters.set(FEWER_STARS)
@@ -68,6 +70,7 @@ def test_it_is_solved_with_the_stored_parameters(tmp_path):
     assert len({result.matched for result in results}) == 1
 
 
+@pytest.mark.long
 def test_after_a_reset_it_is_solved_with_the_restored_parameters(tmp_path):
     async def reset(emulation):
         emulation.device.parameters.set(FEWER_STARS)

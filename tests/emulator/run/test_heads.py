@@ -92,6 +92,7 @@ def test_the_control_channel_commands_each_head_and_changes_the_truth_of_all(run
     assert bad == {"ok": False, "error": "head: must be 1 to 2, not 3"}
 
 
+@pytest.mark.long
 def test_heads_on_the_real_clock_expose_by_themselves(run):
     async def scenario(emulation, _line):
         await until(lambda: not any(each.device.cycle.published < 2 for each in emulation.heads))

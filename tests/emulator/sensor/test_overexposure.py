@@ -139,6 +139,7 @@ def setups():
     }
 
 
+@pytest.mark.long
 def test_after_dazzling_stars_are_missing_for_seconds_and_no_attitude_is_wrong(setups):
     sun = {"sun": {"ra_deg": 84.0, "dec_deg": -1.0, "exclusion_deg": 20.0}}
     truths = [ORION.rotated((0.0, 0.0, 0.01 * k)) for k in range(40)]

@@ -49,6 +49,7 @@ def hits(count: int, energy_mev: float | None = None) -> tuple[np.ndarray, np.nd
     return np.array(runs), np.array(charges)
 
 
+@pytest.mark.long
 def test_three_quarters_of_the_tracks_stay_within_a_pixel_and_a_half():
     """Through a layer of thickness t, an isotropic flux falls as sin 2θ, and the run is t·tan θ: sin²(arctan 1.8) = 76 %."""
     rng = np.random.default_rng(6)
@@ -59,6 +60,7 @@ def test_three_quarters_of_the_tracks_stay_within_a_pixel_and_a_half():
         assert np.mean(runs <= run) == pytest.approx(share, abs=0.01)
 
 
+@pytest.mark.long
 def test_a_proton_of_50_mev_leaves_some_8000_electrons():
     """Median of an isotropic flux: the path through the layer is t·√2; the most probable loss is below the mean."""
     _, charges = hits(4000, 50.0)

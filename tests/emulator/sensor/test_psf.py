@@ -31,6 +31,7 @@ def centre(image: np.ndarray) -> tuple[float, float]:
     return float((columns * image).sum() / image.sum()), float((rows * image).sum() / image.sum())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", [(30.0, 30.0), (30.5, 30.5), (31.23, 28.71)])
 def test_a_spot_is_the_gaussian_integrated_over_pixels(place: tuple[float, float]) -> None:
     image = draw([*place, 0.0, 0.0, 0.0, 0.0])

@@ -215,6 +215,7 @@ def test_a_stk_ephemeris_has_its_positions(tmp_path: Path) -> None:
         assert orbit.state(START_UNIX_S + t).position_m == pytest.approx(row[:3], abs=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("with_rates", [True, False])
 def test_a_ck_has_the_attitudes_that_spice_gives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_rates: bool

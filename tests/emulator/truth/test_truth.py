@@ -386,6 +386,7 @@ def test_a_wrong_convention_is_found_at_slow_rates_and_quick_feeds_too(rate_deg_
     assert not any(taken[int(12.0 / period) :])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("with_t", [True, False])
 @pytest.mark.parametrize(("period", "repeat"), [(0.01, 1), (0.01, 10), (0.1, 1), (0.1, 5), (1.0, 1)])
 def test_a_feed_whose_rate_fits_is_never_rejected(period, repeat, with_t):

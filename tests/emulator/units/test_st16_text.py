@@ -187,6 +187,7 @@ def test_edac_memory_is_cleared_when_the_unit_starts():
     with_unit("st16", "serial", scenario)
 
 
+@pytest.mark.long
 def test_time_is_48_bits_of_microseconds():  # 35918
     def scenario(unit: Emulated) -> None:
         first = int.from_bytes(asked(unit, TIME), "little")

@@ -11,6 +11,7 @@ from starhil.protocol.export.c import files, prefix_of
 from starhil.protocol.serial.stack import SerialStack
 from starhil.protocol.unit import load_unit
 
+pytestmark = pytest.mark.process
 GCC = shutil.which("gcc")
 PAGE = Path(__file__).parents[3] / "docs" / "c-export.md"
 STATED = re.compile(r"deepest\s+call\s+of\s+any\s+bundled\s+unit\s+takes\s+(\d+)\s+bytes\s+at\s+most")

@@ -175,6 +175,7 @@ def _row_values() -> st.SearchStrategy[tuple[Row, dict[str, Value]]]:
     )
 
 
+@pytest.mark.long
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(_row_values())
 def test_every_row_decodes_the_values_it_encoded(case: tuple[Row, dict[str, Value]]) -> None:

@@ -114,6 +114,7 @@ def test_larger_weights_have_more_influence() -> None:
     assert heavy > 2000.0
 
 
+@pytest.mark.long
 def test_the_covariance_matches_the_scatter_of_many_solutions() -> None:
     rng = np.random.default_rng(13)
     truth, body, reference, _ = scene(rng, random_attitude, 12, 18.0, 0.0)

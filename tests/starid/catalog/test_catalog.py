@@ -61,6 +61,7 @@ def own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
+@pytest.mark.long
 def test_whole_sky_brightest_first(sky: StarCatalog) -> None:
     assert len(sky) == 117_957
     assert (np.diff(sky.v) >= 0).all()
@@ -374,6 +375,7 @@ def test_epochs_out_of_range_are_rejected(epoch: float) -> None:
         load_catalog(epoch=epoch)
 
 
+@pytest.mark.long
 def test_cache_is_used_and_rebuilt_when_damaged(own_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = load_catalog()
     (stored,) = own_cache.glob("hipparcos-*.npz")

@@ -60,6 +60,7 @@ def test_chi_cygni_is_brightest_within_weeks_of_its_maximum_of_late_may_2013() -
     assert light.min() == pytest.approx(3.3, abs=0.01)
 
 
+@pytest.mark.long
 def test_curves_are_continuous() -> None:
     for star in VARIABLE_STARS:
         days = np.linspace(0.0, star.period_d, 4001)

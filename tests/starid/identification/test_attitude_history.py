@@ -53,6 +53,7 @@ def test_an_interruption_or_a_longer_gap_ends_the_history():
     assert recent.rate() is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("window", [2, 3, 10])
 def test_the_error_of_a_prediction_is_as_large_as_stated(window):
     """One second after attitudes half a second apart; of those within two seconds."""

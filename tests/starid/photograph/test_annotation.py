@@ -44,6 +44,7 @@ def test_the_legend_covers_no_star(corner):
     assert np.hypot(example[0] - corner[0], example[1] - corner[1]) > 4 * RADIUS_PX
 
 
+@pytest.mark.long
 def test_an_image_too_small_for_a_legend_has_none():
     image = annotate(SKY[:48, :64], np.array([[20.0, 20.0]]), [""], missed_xy_px=np.array([[44.0, 30.0]]))
     assert circles(image, MISS_BGR) == [(44, 30)]

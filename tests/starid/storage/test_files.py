@@ -174,6 +174,7 @@ def test_a_stream_without_a_suffix_gets_a_png(tmp_path: Path) -> None:
     assert contents[0].startswith(b"\x89PNG")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("reader", "error_type"), READERS)
 @pytest.mark.parametrize("kind", ["zero", "pipe", "folder"])
 def test_only_regular_files_are_read(

@@ -155,6 +155,7 @@ def test_an_option_that_the_algorithm_does_not_have_is_named(algorithm, option, 
         )
 
 
+@pytest.mark.long
 def test_frames_are_solved_while_another_index_is_built_and_then_the_new_limit_holds():
     profile = Profile.model_validate({"identifier": {"cache": False}, "catalog": {"epoch": 2026.0}})
     setup = replace(pipeline_setup(profile), build_in_background=True)

@@ -61,6 +61,7 @@ def test_a_body_in_the_field_is_the_reason_where_stars_are_missing(reason):
     assert (found.reason, found.in_field) == ("ok", ("moon",))
 
 
+@pytest.mark.long
 def test_a_jump_with_a_moon_in_the_corner_loses_the_prediction_and_is_not_blinded(pipeline):
     moon = {"ra_deg": 93.5, "dec_deg": -10.0}
     elsewhere = Attitude.from_radec_roll(110.0, 30.0, 0.0)

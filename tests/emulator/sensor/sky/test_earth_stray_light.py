@@ -40,6 +40,7 @@ def test_a_small_earth_is_a_sun_as_bright_as_its_disc(away_deg):
     assert glow_e_s(SkyObjects(earth=earth)) == pytest.approx(expected, rel=2e-3)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sun_deg", [(180.0, 0.0), (60.0, 30.0), (10.0, -70.0)])
 def test_a_wide_earth_gives_the_sum_over_its_parts(sun_deg):
     """200 000 random lines of sight to a sphere of radius 1, each as bright as the cosine of the Sun's zenith distance."""

@@ -280,6 +280,7 @@ def switches(blinded, step_s: int = 20) -> list[int]:
     return angles
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("off_sun_deg", "earth_deg"), [(25.0, 20.0), (70.0, 25.0), (150.0, 10.0)])
 def test_a_sensor_is_blinded_along_its_orbit_where_geometry_predicts(off_sun_deg, earth_deg):
     sky = Sky({"bodies": "ephemeris", "sun": {"exclusion_deg": 35.0}, "earth": {"exclusion_deg": earth_deg}})

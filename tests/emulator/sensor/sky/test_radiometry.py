@@ -119,6 +119,7 @@ def test_a_full_moon_ten_degrees_off_the_boresight_costs_the_stars_around_it(gla
     assert most - 0.3 < magnitudes[1] / magnitudes[0] <= most
 
 
+@pytest.mark.long
 def test_a_baffle_leaves_tenfold_less_sunlight_for_each_decade_of_angle_outside_the_exclusion_angle():
     """From the light that a bare lens scatters, which is the same law without a baffle, to `stray_share` of it."""
     sun = {"ra_deg": 83.8, "exclusion_deg": 30.0}

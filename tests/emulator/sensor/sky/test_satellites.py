@@ -143,6 +143,7 @@ def test_they_are_seen_only_from_an_orbit() -> None:
     assert load_profile("ideal", ["orbit=leo", "sky.satellites.count=40"]).sky["satellites"]["count"] == 40
 
 
+@pytest.mark.long
 def test_many_bright_ones_cost_stars_and_no_attitude_is_wrong() -> None:
     """Six thousand at 1500 km, 250 times as bright as Starlink, in 40 images of the field of `ideal`."""
     profile = load_profile("ideal")

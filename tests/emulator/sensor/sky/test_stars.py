@@ -80,6 +80,7 @@ def test_another_star_does_not_change_the_errors_of_the_others() -> None:
     assert fainter == pytest.approx(0.3 * drawn[:, 2])
 
 
+@pytest.mark.long
 def test_the_attitude_is_off_by_the_mean_of_its_stars_errors() -> None:
     """Without noise, n stars of equal weight with an error σ along each axis leave σ/√n across the boresight."""
     catalog = load_catalog()

@@ -143,6 +143,7 @@ def test_a_catalogue_without_stars_is_rejected(limit: float | None) -> None:
         Identifier(catalog=load_catalog().brighter_than(-5.0), limiting_magnitude=limit, cache=False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("model", ["pinhole", "equidistant", "flat"])
 def test_a_position_far_outside_the_image_counts_as_a_false_star(model: Model) -> None:
     camera = Camera.from_fov(42.0, model=model)
