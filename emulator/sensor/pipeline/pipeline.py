@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import itertools
 import math
 import subprocess
@@ -173,7 +172,6 @@ class Pipeline:
             preview=self._setup.previews,
         )
         if helper is not None:
-            gc.disable()  # compiling makes many objects and little garbage
             for rate in _WARM_UP_RATES_RAD_S:
                 frame = self._renderer.render(Attitude.identity(), rate, exposure_s=_WARM_UP_EXPOSURE_S)
                 detect(frame.image, detection_settings(self._sensor.detection_settings(), settings))
@@ -182,7 +180,6 @@ class Pipeline:
             turning = TruthState(attitude, np.array(rate))
             self._process_frame(replace(request, truth=turning, predicted=predicted))
         self._last = None
-        gc.enable()
 
     def handle(
         self, request: FrameRequest | ImageRequest | JpgRequest | IndexRequest

@@ -9,13 +9,17 @@ import signal
 import socket
 import sys
 import threading
+from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from starhil.emulator.errors import one_line
 from starhil.emulator.sensor.pipeline.messages import LENGTH, Failure, with_length
 from starhil.emulator.sensor.pipeline.precompile import start_helper
 from starhil.emulator.simulation.parent_death_signal import end_with_parent
+
+if TYPE_CHECKING:
+    from starhil.emulator.sensor.pipeline.pipeline import Pipeline
 
 NICE: Final = 5
 """Niceness of the worker, so that the links have priority on a busy machine."""
@@ -27,7 +31,7 @@ def main() -> None:
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the emulator ends this process by closing the socket
     os.nice(NICE)
-    serve(socket.socket(fileno=int(sys.argv[1])))
+    serve(socket.socket(fileno=int(sys.argv[1])), started=gc.freeze)  # what was imported is never garbage
 
 
 def call_first_kernel() -> None:
@@ -56,24 +60,36 @@ def serve_in_thread(link: socket.socket) -> None:
             _send(link, f"pipeline thread: ended: {one_line(error)}")
 
 
-def serve(link: socket.socket) -> None:
-    """Receive the setup, then requests, until the emulator closes the socket."""
-    gc.disable()  # until the pipeline is warm: imports make many objects and little garbage
+def serve(link: socket.socket, started: Callable[[], None] = lambda: None) -> None:
+    """Receive the setup, then requests, until the emulator closes the socket; `started` is called when the pipeline is ready."""
+    gc.disable()  # imports and compiling make many objects and little garbage
+    try:
+        pipeline = _make_pipeline(link)
+        started()
+    finally:
+        gc.enable()
+    if pipeline is None:
+        return
+    while (request := _receive(link)) is not None:
+        _send(link, pipeline.handle(request))
+
+
+def _make_pipeline(link: socket.socket) -> Pipeline | None:
+    """Make the pipeline of the setup that is received, and report it; return None if there is none."""
     helper = start_helper()
     call_first_kernel()
     from starhil.emulator.sensor.pipeline.pipeline import make_pipeline  # imported while the emulator starts
 
     setup = _receive(link)
     if setup is None:
-        return
+        return None
     made = make_pipeline(setup, helper)
     if isinstance(made, Failure):
         _send(link, made)
-        return
+        return None
     pipeline, warm = made
     _send(link, warm)
-    while (request := _receive(link)) is not None:
-        _send(link, pipeline.handle(request))
+    return pipeline
 
 
 def _receive(link: socket.socket) -> Any:

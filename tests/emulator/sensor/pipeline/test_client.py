@@ -1,6 +1,7 @@
 """The outcome of requests when an answer's callback fails, or when the pipeline ends in the middle."""
 
 import asyncio
+import gc
 import pickle
 
 import pytest
@@ -203,6 +204,7 @@ def test_a_thread_whose_pipeline_cannot_be_made_reports_it(monkeypatch):
         try:
             with pytest.raises(EmulatorError, match="ValueError: odd camera"):
                 await asyncio.wait_for(imager.start(), PATIENCE_S)
+            await until(gc.isenabled)
         finally:
             await imager.close()
 
