@@ -64,7 +64,7 @@ def serve(link: socket.socket, started: Callable[[], None] = lambda: None) -> No
     """Receive the setup, then requests, until the emulator closes the socket; `started` is called when the pipeline is ready."""
     gc.disable()  # imports and compiling make many objects and little garbage
     try:
-        pipeline = _make_pipeline(link)
+        pipeline = _start(link)
         started()
     finally:
         gc.enable()
@@ -74,7 +74,7 @@ def serve(link: socket.socket, started: Callable[[], None] = lambda: None) -> No
         _send(link, pipeline.handle(request))
 
 
-def _make_pipeline(link: socket.socket) -> Pipeline | None:
+def _start(link: socket.socket) -> Pipeline | None:
     """Make the pipeline of the setup that is received, and report it; return None if there is none."""
     helper = start_helper()
     call_first_kernel()

@@ -23,7 +23,7 @@ from starhil.emulator.truth.feed import MAX_LINES, MAX_WAITING, LiveFeed, _Datag
 from starhil.emulator.truth.live import LiveTruth
 from starhil.hil_tests.session.script import ScriptError, load_script
 from starhil.protocol.errors import LONGEST_PROBLEM, MAX_PROBLEMS
-from starhil.protocol.transports.connections import Budget
+from starhil.protocol.transports.connections import FREE_IN_ALL, Budget
 from starhil.protocol.unit import load_unit
 from starid.attitude import Attitude
 from tests.fuzzing.control import _Loop
@@ -167,7 +167,7 @@ def test_a_flood_of_datagrams_takes_short_turns_and_no_more_than_its_share_of_th
         feed.close()
         return share
 
-    assert asyncio.run(main()) < 0.4  # of which 0.3 are free
+    assert asyncio.run(main()) < FREE_IN_ALL + 0.1
     assert float(np.median(turns)) < 0.002
 
 
