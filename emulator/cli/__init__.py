@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import sys
 from contextlib import suppress
@@ -28,6 +29,7 @@ def main() -> None:
                 from starhil.emulator.sensor.pipeline.worker_process import start_ahead
 
                 start_ahead()  # the worker takes longest to start, so it is started before the imports of this process
+            gc.disable()  # until the emulator is ready: imports make many objects and little garbage
         from starhil.emulator.cli.app import main as run
     except KeyboardInterrupt:
         raise SystemExit(130) from None

@@ -350,6 +350,7 @@ async def _serve(make: Callable[[], Emulator]) -> int:
             if line.done():
                 gc.collect()
                 gc.freeze()  # long-lived objects: garbage collection would pause the links
+                gc.enable()
                 print(line.result(), flush=True)
                 await stop
             else:
