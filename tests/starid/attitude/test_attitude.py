@@ -34,7 +34,7 @@ def matrix_by_definition(ra_deg: float, dec_deg: float, roll_deg: float) -> np.n
 
 
 @given(angles, declinations, angles)
-@settings(deadline=None, derandomize=True, max_examples=300)
+@settings(deadline=None, derandomize=True, max_examples=100)
 def test_round_trip_over_the_whole_sky(ra: float, dec: float, roll: float) -> None:
     attitude = Attitude.from_radec_roll(ra, dec, roll)
     np.testing.assert_allclose(attitude.matrix, matrix_by_definition(ra, dec, roll), atol=ROUND_OFF)

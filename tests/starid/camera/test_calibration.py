@@ -166,13 +166,14 @@ def test_other_lenses_and_false_matches(
 
 
 def test_the_covariance_matches_the_errors(sky: StarCatalog) -> None:
+    """Chi-squared of eight degrees of freedom, a mean of its share: within three standard errors."""
     ratios = []
-    for seed in range(25):
+    for seed in range(10):
         frames, _ = simulated(sky, WIDE, 3, 100 + seed)
         result = calibrate(frames, DEFAULT_CAMERA, WITH_ASPECT)
         error = (values(result.camera) - values(WIDE))[:8]
         ratios.append(error @ np.linalg.solve(result.covariance[:8, :8], error) / 8.0)
-    assert np.mean(ratios) == pytest.approx(1.0, abs=0.3)
+    assert np.mean(ratios) == pytest.approx(1.0, abs=3.0 * math.sqrt(2.0 / 8.0 / len(ratios)))
 
 
 def test_the_minimum_agrees_with_scipy(sky: StarCatalog) -> None:
@@ -388,11 +389,11 @@ def detected(sky: StarCatalog, camera: Camera, count: int, seed: int) -> tuple[l
 
 def test_self_calibration_from_a_rough_field_of_view(sky: StarCatalog) -> None:
     start = Camera.from_fov(42.0 * 1.04)
-    frames, truths = detected(sky, WIDE, 6, 21)
+    frames, truths = detected(sky, WIDE, 4, 21)
     empty = Stars(np.array([[10.0, 10.0], [500.0, 600.0]]), np.array([2.0, 1.0]))
     result = self_calibrate([*frames, empty], start, fov_tolerance=0.1)
-    assert result.frame_index == (0, 1, 2, 3, 4, 5)
-    assert result.unidentified == {6: "too_few_stars"}
+    assert result.frame_index == (0, 1, 2, 3)
+    assert result.unidentified == {4: "too_few_stars"}
     assert mapping_error_px(WIDE, start) > 10.0
     assert mapping_error_px(WIDE, result.calibration.camera) < 0.15
     assert result.calibration.sigma_px == pytest.approx(SIGMA_PX, rel=0.2)
@@ -409,7 +410,7 @@ def test_a_perfect_lens_gets_no_more_parameters_than_it_needs(sky: StarCatalog) 
 
 def test_frames_of_random_points_are_rejected() -> None:
     rng = np.random.default_rng(23)
-    noise = [Stars(rng.uniform(0, 936, (40, 2)), rng.uniform(1, 9, 40)) for _ in range(2)]
+    noise = [Stars(rng.uniform(0, 936, (25, 2)), rng.uniform(1, 9, 25)) for _ in range(2)]
     with pytest.raises(StaridError, match="none of 2 frames could be identified"):
         self_calibrate(noise, DEFAULT_CAMERA, fov_tolerance=0.01)
     with pytest.raises(StaridError, match="no frames"):

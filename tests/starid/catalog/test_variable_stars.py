@@ -22,7 +22,7 @@ def curve(name: str, julian_dates: np.ndarray) -> np.ndarray:
 
 def test_algol_is_faint_when_goodricke_saw_it_faint_as_long_as_stebbins_measured() -> None:
     """2 days 20.8 h apart (Phil. Trans. 1783), 9.8 h from first to last contact (ApJ 32, 1910, 185), V 2.12 to 3.39."""
-    hours = np.arange(0.0, 30.0 * 24.0, 0.1)
+    hours = np.arange(0.0, 30.0 * 24.0, 0.2)
     light = curve("Algol", 2_461_000.5 + hours / 24.0)
     lowest = hours[1:-1][(light[1:-1] < light[:-2]) < (light[1:-1] > light[2:])]
     assert np.diff(lowest).mean() == pytest.approx(68.8, abs=0.1)
@@ -63,9 +63,9 @@ def test_chi_cygni_is_brightest_within_weeks_of_its_maximum_of_late_may_2013() -
 @pytest.mark.long
 def test_curves_are_continuous() -> None:
     for star in VARIABLE_STARS:
-        days = np.linspace(0.0, star.period_d, 4001)
+        days = np.linspace(0.0, star.period_d, 1001)
         light = curve(star.name, star.epoch_jd + days)
-        assert np.abs(np.diff(light)).max() < 0.03 * (star.faintest - star.brightest), star.name
+        assert np.abs(np.diff(light)).max() < 0.05 * (star.faintest - star.brightest), star.name
         assert light.min() >= star.brightest - 1e-9
 
 

@@ -66,7 +66,7 @@ def test_frames_that_show_no_sky_end_in_status_1(
 ) -> None:
     write_image(tmp_path / "noise.png", NOISE)
     output = tmp_path / "camera.toml"
-    assert run(monkeypatch, *images, str(tmp_path / "noise.png"), "--fov", "41", "-o", str(output)) == 1
+    assert run(monkeypatch, images[0], str(tmp_path / "noise.png"), "--fov", "41", "-o", str(output)) == 1
     out = capsys.readouterr().out
     assert "not identified" in out
     assert "noise.png" in out

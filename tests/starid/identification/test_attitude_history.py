@@ -59,19 +59,22 @@ def test_the_error_of_a_prediction_is_as_large_as_stated(window):
     """One second after attitudes half a second apart; of those within two seconds."""
     sigma, rng = np.array([1e-4, 2e-4, 3e-4]), np.random.default_rng(1)
     rate = np.array([0.01, -0.02, 0.03])
-    squares, stated = [], np.zeros((3, 3))
-    for _ in range(2000):
+    squares, recent, samples = [], AttitudeHistory(window), 1000
+    *truths, truth = (
+        propagate(Attitude.identity(), rate, time_s)
+        for time_s in [*0.5 * np.arange(window), 0.5 * window + 0.5]
+    )
+    at = 0.5 * window + 0.5
+    for _ in range(samples):
         recent = AttitudeHistory(window)
-        for number in range(window):
-            truth = propagate(Attitude.identity(), rate, 0.5 * number)
-            recent.add(
-                0.5 * number, truth.rotated(sigma * rng.standard_normal(3)), 1.0, np.diag(sigma**2), 40.0
-            )
-        at = 0.5 * (window - 1) + 1.0
-        stated, _ = recent.uncertainty(at)
-        error = recent.predict(at, recent.rate()).error_to(propagate(Attitude.identity(), rate, at))
+        for number, attitude in enumerate(truths):
+            noisy = attitude.rotated(sigma * rng.standard_normal(3))
+            recent.add(0.5 * number, noisy, 1.0, np.diag(sigma**2), 40.0)
+        error = recent.predict(at, recent.rate()).error_to(truth)
         squares.append(error.rotation_vector_rad**2)
-    assert np.mean(squares, axis=0) / np.diag(stated) == pytest.approx(1.0, abs=4.0 * math.sqrt(2.0 / 2000))
+    stated, _ = recent.uncertainty(at)
+    bound = 4.0 * math.sqrt(2.0 / samples)
+    assert np.mean(squares, axis=0) / np.diag(stated) == pytest.approx(1.0, abs=bound)
 
 
 def test_two_attitudes_have_fewer_degrees_of_freedom_than_their_sum():

@@ -57,22 +57,23 @@ def solve(found: Detections, predicted: Attitude, stars: StarCatalog, prior: np.
     )
 
 
-@pytest.mark.parametrize("ratio", [3.0, 3.5, 4.0])
-def test_peaks_of_smoothed_noise_are_as_many_as_stated(ratio: float) -> None:
+def test_peaks_of_smoothed_noise_are_as_many_as_stated() -> None:
     size, sigma = 2000, 2.5
     field = gaussian_filter(np.random.default_rng(1).standard_normal((size, size)), sigma, mode="wrap")
     field /= field.std()
-    peaks = np.count_nonzero((field == maximum_filter(field, 3, mode="wrap")) & (field > ratio))
-    expected = size * size * float(noise_peaks(np.array(ratio), sigma))
-    # the formula counts maxima less saddles and minima: right to a few per cent at these levels
-    assert peaks == pytest.approx(expected, abs=4.0 * math.sqrt(expected) + 0.1 * expected)
+    is_peak = field == maximum_filter(field, 3, mode="wrap")
+    for ratio in (3.0, 3.5, 4.0):
+        peaks = np.count_nonzero(is_peak & (field > ratio))
+        expected = size * size * float(noise_peaks(np.array(ratio), sigma))
+        # the formula counts maxima less saddles and minima: right to a few per cent at these levels
+        assert peaks == pytest.approx(expected, abs=4.0 * math.sqrt(expected) + 0.1 * expected), ratio
 
 
 def test_the_error_with_few_stars_is_as_stated(bright: StarCatalog) -> None:
     squares = []
-    for count, least in ((2, 20), (3, 90), (5, 96)):
+    for count, least in ((2, 10), (3, 43), (5, 47)):
         rng, before = np.random.default_rng(count), len(squares)
-        for _ in range(100):
+        for _ in range(50):
             truth = random_attitude(rng)
             error = np.sqrt(np.diag(PRIOR)) * rng.standard_normal(3)
             solution = solve(image(truth, bright, count, rng), truth.rotated(error), bright)
@@ -89,7 +90,7 @@ def test_the_error_with_few_stars_is_as_stated(bright: StarCatalog) -> None:
 
 def test_one_star_is_not_enough(bright: StarCatalog) -> None:
     rng = np.random.default_rng(4)
-    for _ in range(100):
+    for _ in range(30):
         truth = random_attitude(rng)
         assert not solve(image(truth, bright, 1, rng), truth, bright).valid
 
@@ -120,7 +121,7 @@ LIMIT_RAD = math.radians(0.1)
 CONTRADICTION = stats.chi2.ppf(0.999, 3)
 
 
-SAMPLES = 200_000
+SAMPLES = 50_000
 
 
 def simulated_shares(
@@ -167,7 +168,7 @@ def test_an_attitude_that_rests_on_the_prediction_is_invalid_where_many_predicti
 ) -> None:
     """Three stars close together do not show a roll about them."""
     valid = {1e-3: 0, 1.0: 0}
-    for seed in range(60):
+    for seed in range(30):
         rng = np.random.default_rng(seed)
         truth = random_attitude(rng)
         rows, xy = expected_places(DEFAULT_CAMERA, bright, truth)
@@ -179,5 +180,5 @@ def test_an_attitude_that_rests_on_the_prediction_is_invalid_where_many_predicti
                 wrong_predictions=share,
             )  # fmt: skip
             valid[share] += solution.valid
-    assert valid[1e-3] > 40
-    assert valid[1.0] < 20
+    assert valid[1e-3] > 20
+    assert valid[1.0] < 10

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import logging
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
-from starid.catalog import load_catalog
+from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.identification.geometric import index_file
 from starid.identification.geometric.identifier import Identifier
@@ -27,10 +28,19 @@ DEEP = 200_000
 """Brackets that no version of Python decodes: 3.13 decodes 9 000."""
 
 
+@functools.cache
+def bright() -> StarCatalog:
+    return load_catalog().brighter_than(4.0)
+
+
+def made(cache: Path) -> Identifier:
+    return Identifier(CAMERA, bright(), limiting_magnitude=4.0, cache=cache)
+
+
 @pytest.fixture(scope="module")
 def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("index")
-    Identifier(CAMERA, limiting_magnitude=4.0, cache=folder)
+    made(folder)
     (path,) = folder.iterdir()
     return path
 
@@ -41,7 +51,7 @@ def key_of(path: Path) -> str:
 
 def test_index_is_written_once_and_is_small(stored: Path) -> None:
     before = stored.stat().st_mtime_ns
-    Identifier(CAMERA, limiting_magnitude=4.0, cache=stored.parent)
+    made(stored.parent)
     assert stored.stat().st_mtime_ns == before
     assert stored.stat().st_size < MAX_BYTES
 
@@ -78,7 +88,7 @@ def test_a_damaged_file_is_reported_and_built_again(
     path = tmp_path / stored.name
     path.write_bytes(damage(good))
     with caplog.at_level(logging.WARNING):
-        identifier = Identifier(CAMERA, limiting_magnitude=4.0, cache=tmp_path)
+        identifier = made(tmp_path)
     assert str(path) in caplog.text
     assert message in caplog.text
     assert path.read_bytes() == good
@@ -97,7 +107,7 @@ def test_an_unwritable_folder_only_prevents_caching(tmp_path: Path, caplog: pyte
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
     with caplog.at_level(logging.WARNING):
-        Identifier(CAMERA, limiting_magnitude=4.0, cache=blocked)
+        made(blocked)
     assert "cannot be written" in caplog.text
 
 
@@ -107,8 +117,8 @@ def test_a_sky_without_triangles_is_rejected() -> None:
 
 
 def test_the_stars_of_an_index_are_the_same_from_the_cache(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
     catalog = load_catalog()
+    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
     settings = index_settings(DEFAULT_CAMERA, catalog, 5.0, 2.0, 12.0)
     expected = resolved_stars(catalog, 5.0, settings.blend_rad)
     for _ in range(2):

@@ -214,7 +214,7 @@ def test_a_covariance_that_is_not_positive_is_named() -> None:
         identifier().track(xy, flux, AT, errors)
 
 
-FEW = 300
+FEW = 150
 SCENE = SceneSettings(5.5, 0.5)
 
 
