@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, Literal, TypeAlias
 
 from starhil.protocol.errors import IcdError, did_you_mean
@@ -21,10 +24,12 @@ SKELETON: Final = CONFIGS / "new_unit.toml"
 """Template that `starhil unit new` copies."""
 
 
-def bundled(kind: Kind) -> dict[str, Path]:
+@cache
+def bundled(kind: Kind) -> Mapping[str, Path]:
     """Return the files (for units, the folders) that ship with the package, by name."""
     files = (CONFIGS / f"{kind}s").glob("*/*.toml" if kind == "unit" else "*.toml")
-    return {path.stem: path for path in sorted({file.parent if kind == "unit" else file for file in files})}
+    found = sorted({file.parent if kind == "unit" else file for file in files})
+    return MappingProxyType({path.stem: path for path in found})
 
 
 def find(kind: Kind, name: str | Path) -> Path:
