@@ -10,6 +10,7 @@ import pytest
 
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.telemetry_faults import EFFECTS, TelemetryFault
+from tests.process.conftest import NO_IMAGES
 from tests.test_docs import DOCS, blocks
 from tests.waiting import PATIENCE_S
 
@@ -24,7 +25,9 @@ def example(name):
 
 @pytest.mark.process
 def test_the_pytest_matrix_passes(tmp_path):
-    (tmp_path / "test_fdir.py").write_text(example("test_fdir.py"))
+    text, count = re.subn(r"settings=\[", f"\\g<0>*{NO_IMAGES}, ", example("test_fdir.py"))
+    assert count == 1
+    (tmp_path / "test_fdir.py").write_text(text)
     command = ["-m", "pytest", "-q", "-p", "no:cacheprovider", f"--rootdir={tmp_path}", "test_fdir.py"]
     done = subprocess.run(
         [sys.executable, *command], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S

@@ -200,15 +200,6 @@ def test_the_example_of_a_scenario_is_accepted(tmp_path):
 
 
 @pytest.mark.process
-def test_the_example_of_a_session_passes(tmp_path):
-    path = tmp_path / "quick_check.toml"
-    path.write_text(example("sessions.md", 'title = "Quick check"'), encoding="utf-8")
-    words = ["session", str(path), "--start", "--serial", "auto", "--log", str(tmp_path / "log")]
-    status, out, said = run_command_line(*words)
-    assert status == 0, out + said
-
-
-@pytest.mark.process
 def test_the_control_channel_answers_as_the_page_shows():
     text = (DOCS / "control.md").read_text(encoding="utf-8")
     pairs = re.findall(r"^→ (.*)\n← (.*)$", text, re.MULTILINE)

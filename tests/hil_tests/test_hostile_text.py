@@ -13,6 +13,7 @@ from starhil.hil_tests.conformance.runner import Outcome
 from starhil.hil_tests.reports import FAILED, TestCase, write_junit
 from starid.cli.command_line import exit_for_bad_input
 from tests.emulator.cli.command_line import run_command_line
+from tests.process.conftest import NO_IMAGES
 
 HOSTILE = "a\x1b]0;b\x07\x00\x9b2J\u202ec\ufffe\ud800"
 SHOWN = "a\\x1b]0;b\\x07\\x00\\x9b2J\\u202ec\\ufffe\\ud800"
@@ -57,7 +58,10 @@ def test_a_case_of_conformance_is_shown_with_its_control_characters_escaped():
 def test_title_and_steps_of_a_session_are_shown_with_their_control_characters_escaped(tmp_path):
     script = tmp_path / "s.toml"
     text = r'"a\u001b]0;b\u0007\u009b2J\u202ec\nd"'
-    script.write_text(f"title = {text}\n[[step]]\nname = {text}\nwait_s = 0\n", encoding="ascii")
+    script.write_text(
+        f"title = {text}\n[emulator]\nset = {[*NO_IMAGES]}\n[[step]]\nname = {text}\nwait_s = 0\n",
+        encoding="ascii",
+    )
     status, out, err = run_command_line("session", str(script), "--start", "--log", str(tmp_path))
     assert status in (0, 1), err
     assert not set(out) & set("\x1b\x07\x9b\u202e")

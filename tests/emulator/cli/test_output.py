@@ -29,6 +29,7 @@ from tests.emulator.workers import WORKER
 from tests.waiting import PATIENCE_S
 
 PROGRAM = [sys.executable, "-c", "from starhil.emulator.cli import main; main()"]
+STDOUT = "/proc/self/fd/1"
 WRITTEN = {"--output", "--junit", "--html", "--truth-log"}
 """Options that name a file to write; `hub --log` is one too, the other logs are not."""
 
@@ -99,21 +100,26 @@ def test_missing_folders_are_made_and_a_file_in_their_place_is_rejected(
 
 
 @pytest.mark.process
-def test_an_export_to_the_standard_output_is_in_utf_8_whatever_its_encoding_is() -> None:
+def test_an_export_to_the_standard_output_is_in_utf_8_whatever_its_encoding_is(
+    capfdbinary: pytest.CaptureFixture[bytes],
+) -> None:
     plain = starhil("icd", "export", "markdown", PYTHONIOENCODING="ascii").stdout
-    assert starhil("icd", "export", "markdown", "-o", "/proc/self/fd/1").stdout == plain
+    assert run_command_line("icd", "export", "markdown", "-o", STDOUT) == (0, "", "")
+    assert capfdbinary.readouterr().out == plain
     assert run_command_line("icd", "export", "markdown") == (0, plain.decode("utf-8"), "")
     assert not plain.isascii()
 
 
-@pytest.mark.process
-def test_an_image_on_the_standard_output_has_its_report_on_the_standard_error() -> None:
-    done = starhil(
-        "render", "--ra", "83.8", "--dec", "-1.2", "--size", "64", "-o", "/proc/self/fd/1", "--json"
-    )
-    assert done.stdout.startswith(b"\x89PNG")
-    assert done.stdout.endswith(b"IEND\xaeB`\x82")
-    (report,) = log_lines(done.stderr.decode())
+def test_an_image_on_the_standard_output_has_its_report_on_the_standard_error(
+    capfdbinary: pytest.CaptureFixture[bytes],
+) -> None:
+    arguments = ("render", "--ra", "83.8", "--dec", "-1.2", "--size", "64", "-o", STDOUT, "--json")
+    status, out, said = run_command_line(*arguments)
+    assert (status, out) == (0, "")
+    image = capfdbinary.readouterr().out
+    assert image.startswith(b"\x89PNG")
+    assert image.endswith(b"IEND\xaeB`\x82")
+    (report,) = log_lines(said)
     assert json.loads(report)["width"] == 64
 
 
