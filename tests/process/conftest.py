@@ -8,6 +8,7 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import private_can_bus
 from starhil.protocol.transports.can import kernel_can_is_up
+from tests.emulator.emulator_thread import EmulatorThread
 from tests.waiting import PATIENCE_S
 
 FAST_BAUD = 921600
@@ -19,6 +20,13 @@ needs_vcan0 = pytest.mark.skipif(
     not kernel_can_is_up("vcan0"),
     reason="no vcan0 here; tools/test_on_vcan runs this in a guest that has one",
 )
+
+
+@pytest.fixture
+def emulators_in_threads(monkeypatch):
+    """Let the commands that start an emulator, run in the process of the tests, start it there in a thread."""
+    for module in ("session.session_run", "conformance.conformance_run"):
+        monkeypatch.setattr(f"starhil.hil_tests.{module}.EmulatorProcess", EmulatorThread)
 
 
 @pytest.fixture(scope="session")
@@ -73,8 +81,8 @@ def sagitta(tmp_path_factory):
         settings=NO_IMAGES,
         state_dir=tmp_path_factory.mktemp("sagitta"),
     )
-    with EmulatorProcess(command) as process:
-        yield process
+    with EmulatorThread(command) as emulator:
+        yield emulator
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.process.conftest import NO_IMAGES_OPTIONS
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
@@ -59,7 +60,7 @@ def test_endurance_without_dev_shm_names_it(bare_dev):
 
 
 def test_a_pty_without_dev_pts_names_the_way_out(bare_dev):
-    assert starhil("run", "--can", "off", before=bare_dev) == (
+    assert starhil("run", "--can", "off", *NO_IMAGES_OPTIONS, before=bare_dev) == (
         2,
         (
             "starhil: serial pty: no pseudo-terminal is available (No such file or directory): "

@@ -1,4 +1,4 @@
-"""The conformance command against the emulator as a process: pty, bus, CANopen; reports.
+"""The conformance command against an emulator: pty, bus, CANopen; reports.
 
 Choice of cases.
 """
@@ -16,8 +16,9 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from starhil.hil_tests.client import ObcClient
-from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.emulator_process import emulator_command
 from starhil.protocol.files.bundled import find_unit
+from tests.emulator.emulator_thread import EmulatorThread
 from tests.process.conftest import NO_IMAGES, NO_IMAGES_OPTIONS
 from tests.process.test_sessions import starhil
 from tests.waiting import PATIENCE_S
@@ -62,6 +63,7 @@ def conform(*words: str, reports: tuple = ()) -> list[dict]:
 AREAS = ("framing", "frames", "segments", "stuffing", "errors", "timing", "data", "counters", "reset")
 
 
+@pytest.mark.usefixtures("emulators_in_threads")
 def test_areas_pass_on_pty_bus_and_canopen_and_are_reported(tmp_path):
     areas = [f"serial.{area}" for area in AREAS if area not in ("frames", "segments")]
     areas += [f"can.{area}" for area in AREAS if area not in ("framing", "stuffing")]
@@ -83,7 +85,7 @@ def test_a_unit_that_the_run_did_not_start_is_not_changed(tmp_path):
     command = emulator_command(
         seed=1, state_dir=tmp_path, settings=NO_IMAGES, extra=["--clock", f"scaled:{SPEED}"]
     )
-    with EmulatorProcess(command) as emulator:
+    with EmulatorThread(command) as emulator:
         port = emulator.ready["serial"]
         with ObcClient.open(serial=port, timeout_s=PATIENCE_S) as obc:
             before = {name: obc.telemetry(name) for name in rows}
@@ -119,7 +121,7 @@ def test_the_attitude_of_a_running_unit_is_compared_with_its_truth_log_or_a_stat
         truth_log=log,
         settings=["truth.kind=fixed", attitude, *NO_IMAGES],
     )
-    with EmulatorProcess(command) as emulator:
+    with EmulatorThread(command) as emulator:
         words = ("serial.attitude", "--intrusive", "--unit", "sagitta", "--serial", emulator.ready["serial"])
         frames = [
             run_cases((*words, *truth))[1] for truth in ((), ("--truth", log), ("--truth", "83.8,-1.2,30"))

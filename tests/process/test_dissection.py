@@ -12,6 +12,7 @@ from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.unit import load_unit
 from tests.candump import read_candump
+from tests.emulator.emulator_thread import EmulatorThread
 from tests.process.conftest import NO_IMAGES
 from tests.process.test_sessions import starhil
 from tests.protocol.export.dissection import dissect
@@ -81,7 +82,7 @@ def test_no_frame_of_sessions_with_a_canopen_node_is_malformed(tmp_path):
             state_dir=tmp_path / "state",
             extra=["--canopen", str(NODE)],
         )
-        with EmulatorProcess(command):
+        with EmulatorThread(command):
             talk_canopen(channel, tmp_path)
             for name in ("first_light", "errors"):
                 options = ("--can", channel, "--assume-truth", "--intrusive", "--log", tmp_path / name)

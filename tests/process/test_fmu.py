@@ -21,8 +21,9 @@ from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import binom, chi2
 
 from starhil.hil_tests.client import ObcClient
-from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, installed_command
+from starhil.hil_tests.rig.emulator_process import emulator_command, installed_command
 from tests.emulator.cli.command_line import run_command_line
+from tests.emulator.emulator_thread import EmulatorThread
 from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
@@ -55,9 +56,10 @@ def fmu2(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def export(fmi: str, folder: Path) -> Path:
-    profile, quick = folder / "acquiring.toml", folder / QUICK
-    profile.write_text('extends = "ideal"\n[parameters]\nstart_mode = "lost_in_space"\n')
-    quick.write_text(profile.read_text() + '[run]\nworker = "error_model"\n[camera]\ndistortion = []\n')
+    profile = folder / QUICK
+    profile.write_text(
+        'extends = "ideal"\n[parameters]\nstart_mode = "lost_in_space"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
+    )
     target = folder / f"fmi{fmi}.fmu"
     done = run_command_line("fmu", "export", str(profile), "--fmi", fmi, "-o", str(target))
     assert done == (0, "", "")
@@ -106,6 +108,16 @@ def simulate(path: Path, inputs: np.ndarray, step_s: float = STEP_S, **parameter
     )  # fmt: skip
 
 
+@contextmanager
+def stepped_emulator(folder: Path, profile: Path) -> Iterator[dict[str, str]]:
+    """An emulator in lock-step, as the parameters with which an FMU connects to it."""
+    command = emulator_command(
+        profile=str(profile), serial="off", can="off", settings=LOCK_STEP, extra=["--control", f"unix:{folder}/control"]
+    )  # fmt: skip
+    with EmulatorThread(command) as emulator:
+        yield {"feed": emulator.ready["truth"], "control": emulator.ready["control"]}
+
+
 def test_an_exported_orbit_is_a_start_value(tmp_path: Path) -> None:
     target = tmp_path / "leo.fmu"
     assert run_command_line("fmu", "export", "--orbit", "leo", "-o", str(target)) == (0, "", "")
@@ -124,20 +136,22 @@ def test_the_descriptions_pass_the_schema_of_the_standard_and_the_rules_of_fmpy(
 
 
 def test_the_errors_in_a_tumble_agree_with_the_stated_covariance_and_repeat_to_the_byte(
-    fmu2: Path, fmu3: Path
+    fmu2: Path, fmu3: Path, tmp_path: Path
 ) -> None:
     inputs = tumble(15.0)
-    outputs = simulate(fmu3, inputs, profile=str(fmu3.parent / QUICK))
+    with stepped_emulator(tmp_path, fmu3.parent / QUICK) as running:
+        outputs = simulate(fmu3, inputs, **running)
     check_covariance(outputs, inputs)
-    of_version_2 = simulate(fmu2, inputs[:51], profile=str(fmu2.parent / QUICK))
+    of_version_2 = simulate(fmu2, inputs[:51])
     assert of_version_2.tobytes() == outputs[:51].tobytes()
     assert of_version_2["valid"][-1]
 
 
-def test_long_steps_and_a_late_begin_keep_the_stated_covariance(fmu3: Path) -> None:
+def test_long_steps_and_a_late_begin_keep_the_stated_covariance(fmu3: Path, tmp_path: Path) -> None:
     motion = tumble(75.0)
     motion["time"] += 1000.0
-    check_covariance(simulate(fmu3, motion, step_s=5.0, profile=str(fmu3.parent / QUICK)), motion)
+    with stepped_emulator(tmp_path, fmu3.parent / QUICK) as running:
+        check_covariance(simulate(fmu3, motion, step_s=5.0, **running), motion)
 
 
 def check_covariance(outputs: np.ndarray, motion: np.ndarray) -> None:
@@ -180,8 +194,7 @@ class Unit:
         )
         self.slave.instantiate(loggingOn=True, logMessage=self._log)
         self.time = 0.0
-        quick = {"serial": "off", "can": "off", "profile": str(path.parent / QUICK)}
-        for name, value in {**quick, **parameters}.items():
+        for name, value in {"serial": "off", "can": "off", **parameters}.items():
             self.set(name, value)
 
     def _log(self, _environment: object, _status: int, _category: bytes, message: bytes) -> None:
@@ -219,7 +232,8 @@ def tumbling(
     fmu3: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Unit, Iterator[np.void]]]:
     """A unit whose simulation has begun, and the rest of its motion; several tests step it on."""
-    with unit_of(fmu3, tmp_path_factory.mktemp("tumbling")) as unit:
+    folder = tmp_path_factory.mktemp("tumbling")
+    with stepped_emulator(folder, fmu3.parent / QUICK) as running, unit_of(fmu3, folder, **running) as unit:
         with refused("fmi3DoStep"):
             unit.slave.doStep(0.0, STEP_S)
         assert unit.messages == ["step at 0 s: the simulation begins when the initialization mode ends"]
@@ -264,7 +278,7 @@ def test_an_obc_reads_the_same_as_beside_a_simulator_that_speaks_to_the_feed(
         seed=1,
         settings=LOCK_STEP,
     )
-    with EmulatorProcess(command) as emulator:
+    with EmulatorThread(command) as emulator:
         host, port = emulator.ready["truth"].removeprefix("tcp:").split(":")
         with socket.create_connection((host, int(port))) as feed, feed.makefile("rw") as lines:
 
@@ -279,21 +293,15 @@ def test_an_obc_reads_the_same_as_beside_a_simulator_that_speaks_to_the_feed(
 
 
 def test_it_connects_to_an_emulator_that_runs_and_leaves_it_running(fmu3: Path, tmp_path: Path) -> None:
-    control = tmp_path / "control"
-    command = emulator_command(
-        profile=str(fmu3.parent / QUICK), serial="off", can="off",  settings=LOCK_STEP,
-        extra=["--control", f"unix:{control}"],
-    )  # fmt: skip
-    with EmulatorProcess(command) as emulator:
-        feed = emulator.ready["truth"]
-        with unit_of(fmu3, tmp_path, feed=feed, control=f"unix:{control}") as unit:
+    with stepped_emulator(tmp_path, fmu3.parent / QUICK) as running:
+        with unit_of(fmu3, tmp_path, **running) as unit:
             unit.begin()
             for row in tumble(2.5):
                 unit.step(row)
             assert (unit.get("valid"), unit.get("mode")) == (True, "tracking")
             unit.slave.terminate()
         with socket.socket(socket.AF_UNIX) as channel:
-            channel.connect(str(control))
+            channel.connect(running["control"].removeprefix("unix:"))
             channel.sendall(b'{"do": "status"}\n')
             assert json.loads(channel.recv(4096))["ok"]
 
@@ -309,8 +317,7 @@ def test_reset_begins_again_with_the_same_outputs(fmu3: Path, tmp_path: Path) ->
             values.append([unit.get(name) for name in OUTPUTS])
             unit.slave.reset()
             assert unit.get("frame") == 0
-            unit.set("profile", str(fmu3.parent / QUICK))  # a parameter can be set again
-            unit.set("serial", "off")
+            unit.set("serial", "off")  # a parameter can be set again
     assert values[0] == values[1]
     assert values[0][OUTPUTS.index("valid")]
 
@@ -378,7 +385,7 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
     ("parameters", "message"),
     [
         ({"command": "/does/not/exist"}, "/does/not/exist does not start: No such file"),
-        ({"profile": "no_such_profile"}, "does not start: .*no_such_profile"),
+        ({"profile": "wrong.toml"}, "does not start: .*wrong.toml.*: camera.widht: unknown key"),
         (
             {"feed": "127.0.0.1:1", "control": "unix:/none"},
             "no emulator at 127.0.0.1:1 and unix:/none: .*Connection refused",
@@ -386,9 +393,12 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
     ],
 )
 def test_what_does_not_start_says_why(
-    fmu3: Path, tmp_path: Path, parameters: dict[str, object], message: str
+    fmu3: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parameters: dict[str, object], message: str
 ) -> None:
-
+    monkeypatch.chdir(tmp_path)
+    Path("wrong.toml").write_text(
+        f"extends = '{fmu3.parent / QUICK}'\n[run]\nworker = 'error_model'\n[camera]\nwidht = 5\n"
+    )
     with unit_of(fmu3, tmp_path, **parameters) as unit:
         with refused("fmi3ExitInitializationMode"):
             unit.begin()

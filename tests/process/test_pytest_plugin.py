@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import re
 import subprocess
 import sys
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
-from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.emulator_process import emulator_command
+from tests.emulator.emulator_thread import EmulatorThread
 from tests.process.conftest import NO_IMAGES
 from tests.waiting import PATIENCE_S
 
@@ -21,37 +25,49 @@ README_TEST, _ = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_te
 COUNT = PAGE_TESTS.count("def test_")
 
 
-QUICK = 'extends = "ideal"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
-"""Profile of the emulators whose images do not matter."""
+QUICK = 'extends = "{}"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
+"""Profile of the emulators, whose images do not matter."""
 
 
 WITHOUT = [f"-pno:{name}" for name in ("cacheprovider", "hypothesispytest", "xdist", "xdist.looponfail")]
 """Options that load no plugin of others, which takes half of a start."""
 
 
-def run_pytest(folder: Path, programs: str | dict[str, str], *options: str, profile: str = QUICK) -> str:
-    """Run programs of tests in a separate pytest; return its output."""
+def prepared(folder: Path, programs: str | dict[str, str], base: str = "ideal") -> list[str]:
+    """Write programs of tests and a profile into a folder; return the words with which pytest runs them there."""
     files = programs if isinstance(programs, dict) else {"test_it.py": programs}
-    for name, program in files.items():
+    for name, program in {**files, "quick.toml": QUICK.format(base)}.items():
         (folder / name).write_text(program)
-    if profile:
-        (folder / "quick.toml").write_text(profile)
-        options = ("--starhil-profile=quick.toml", *options)
-    command = [sys.executable, "-m", "pytest", *WITHOUT, "-rs", "-v", *options, *files]
+    return [*WITHOUT, "-rs", "-v", "--starhil-profile=quick.toml", *files]
+
+
+def run_pytest(folder: Path, programs: str | dict[str, str], *options: str) -> str:
+    """Run programs of tests in another pytest in this process, with emulators in threads; return its output."""
+    words = [*prepared(folder, programs), "--capture=no", "--import-mode=importlib", *options]
+    output = io.StringIO()
+    with (
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(output),
+        mock.patch("starhil.hil_tests.rig.emulator_process.EmulatorProcess", EmulatorThread),
+    ):
+        pytest.main(words)
+    for name in words:
+        sys.modules.pop(name.removesuffix(".py"), None)  # the next run has another file of the name
+    return output.getvalue()
+
+
+def test_the_example_of_the_readme_passes_in_a_process_of_its_own(tmp_path):
+    command = [sys.executable, "-m", "pytest", *prepared(tmp_path, README_TEST, base="cubestar")]
     done = subprocess.run(
-        command, cwd=folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
-    return done.stdout + done.stderr
-
-
-def test_the_example_of_the_readme_passes(tmp_path):
-    assert "1 passed" in run_pytest(tmp_path, README_TEST, profile="")
+    assert "1 passed" in done.stdout, done.stdout + done.stderr
 
 
 def test_what_a_unit_on_a_serial_line_lacks_is_skipped_by_name(tmp_path):
-    with EmulatorProcess(
-        emulator_command(profile="ideal", settings=NO_IMAGES, state_dir=tmp_path / "unit")
-    ) as unit:
+    command = emulator_command(profile="ideal", settings=NO_IMAGES, state_dir=tmp_path / "unit")
+    with EmulatorThread(command) as unit:
         out = run_pytest(tmp_path, PAGE_TESTS, "--starhil-serial", unit.ready["serial"])
     assert "1 passed, 4 skipped" in out
     assert "test_an_attitude_is_found PASSED" in out

@@ -1,4 +1,4 @@
-"""The shipped sessions, each run against a new emulator process."""
+"""The shipped sessions, each with a new emulator in a thread; `tests/test_page_commands.py` starts processes for some."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from tests.candump import read_candump
 from tests.emulator.cli.command_line import log_lines, run_command_line
+from tests.emulator.emulator_thread import EmulatorThread
 from tests.process.conftest import NO_IMAGES_OPTIONS
 from tests.protocol.export.dissection import dissect
 
@@ -34,7 +34,7 @@ def profiles(tmp_path, monkeypatch):
 
 
 def starhil(*words: object) -> subprocess.CompletedProcess[str]:
-    """Run `starhil` in this process; what it starts are processes."""
+    """Run `starhil` in this process."""
     status, out, errors = run_command_line(*map(str, words))
     return subprocess.CompletedProcess(words, status, out, "\n".join(log_lines(errors)))
 
@@ -51,7 +51,7 @@ def starhil(*words: object) -> subprocess.CompletedProcess[str]:
     ],
     ids=lambda value: value if isinstance(value, str) else "-".join(word[2:] for word in value[::2]),
 )
-@pytest.mark.usefixtures("profiles")
+@pytest.mark.usefixtures("profiles", "emulators_in_threads")
 def test_a_session_passes(name, links, tmp_path):
     junit = tmp_path / "junit.xml"
     done = starhil("session", name, "--start", *links, "--log", tmp_path, "--junit", junit, "--json")
@@ -67,7 +67,7 @@ def test_a_session_passes(name, links, tmp_path):
         assert [frame for frame in dissect(tmp_path / "can.log") if frame.malformed] == []
 
 
-@pytest.mark.usefixtures("profiles")
+@pytest.mark.usefixtures("profiles", "emulators_in_threads")
 def test_the_procedure_for_lissa_s_star_tracker_passes(tmp_path):
     words = (
         *("--unit", "st16", "--start", "--profile", QUICK_IDEAL),
@@ -134,6 +134,7 @@ with = { optical = { blocked_shar = 1.0 } }
 """
 
 
+@pytest.mark.usefixtures("emulators_in_threads")
 def test_a_session_injects_faults_into_the_emulator_that_it_started(tmp_path):
     script = tmp_path / "faults.toml"
     script.write_text(FAULTS)
@@ -177,7 +178,7 @@ def test_the_commands_for_an_emulator_that_runs_work_as_the_page_has_them(tmp_pa
     page = (Path(__file__).parents[2] / "docs" / "sessions.md").read_text(encoding="utf-8")
     (pair,) = re.findall(r"^    (starhil run .*--control.*)\n    (starhil session .*)$", page, re.MULTILINE)
     run, session = (shlex.split(line.replace("/tmp/", f"{tmp_path}/"))[1:] for line in pair)
-    with EmulatorProcess([installed_command(), *run, *NO_IMAGES_OPTIONS]):
+    with EmulatorThread(["starhil", *run, *NO_IMAGES_OPTIONS]):
         done = starhil(*session, "--log", tmp_path / "log")
         assert done.returncode == 0, done.stdout + done.stderr
         moved = starhil("session", "slew_tracking", *session[2:], "--log", tmp_path / "other")
@@ -199,6 +200,7 @@ def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
     assert f"{tmp_path / 'mine.toml'}: run.wrong: unknown key" in done.stderr
 
 
+@pytest.mark.usefixtures("emulators_in_threads")
 @pytest.mark.parametrize(
     ("text", "words", "message"),
     [

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.emulator.emulator_thread import EmulatorThread
 from tests.process.conftest import NO_IMAGES_OPTIONS, needs_vcan0
 from tests.test_docs import PAGES, UNASKED, TypedPage, assert_shown, dumped
 from tests.waiting import PATIENCE_S
@@ -79,12 +80,12 @@ def running(line: str, environment: dict[str, str]) -> Iterator[Typed]:
 
 
 @pytest.fixture(scope="module")
-def emulator(shell):
+def emulator():
     """The emulator that the last page starts; it has all options of the others."""
     run = PAGES["CANopen"].run
     assert all(set(shlex.split(page.run)) <= set(shlex.split(run)) for page in PAGES.values())
-    with running(f"{run} {shlex.join(NO_IMAGES_OPTIONS)}", shell) as emulator:
-        assert emulator.next_line(PATIENCE_S).startswith("ready can=socketcan:vcan0 ")
+    with EmulatorThread([*shlex.split(run), *NO_IMAGES_OPTIONS]) as emulator:
+        assert emulator.ready["can"] == "socketcan:vcan0"
         yield
 
 

@@ -17,6 +17,9 @@ from tests.users import OTHER_USER, needs_others
 
 pytestmark = pytest.mark.process
 
+STARHIL = installed_command()
+STARID = str(Path(STARHIL).with_name("starid"))
+USES_NUMBA = [sys.executable, "-P", "-c", "import starid.kernels.jit"]
 MODULES = ("starhil", "starid", "numpy", "multiprocessing", "json", "struct", "sitecustomize")
 
 
@@ -43,40 +46,34 @@ def test_a_process_that_the_bench_starts_imports_nothing_from_the_working_direct
     assert not was_run.exists()
 
 
-def test_a_command_leaves_the_environment_as_it_is(monkeypatch, tmp_path):
-    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
-    monkeypatch.chdir(tmp_path)
-    run_command_line("endurance", "--unit", "nos3", "--lives", "1", "--steps", "1", "--rendered", "0")
-    assert "PYTHONSAFEPATH" not in os.environ
-
-
 def test_the_processes_of_a_pool_import_nothing_from_the_working_directory(was_run):
-    words = ["endurance", "--unit", "nos3", "--lives", "2", "--steps", "1", "--jobs", "2", "--rendered", "0"]
-    done = subprocess.run([installed_command(), *words], capture_output=True, text=True, check=False)
-    assert (done.returncode, was_run.exists()) == (0, False), done.stderr
+    words = ("endurance", "--unit", "nos3", "--lives", "2", "--steps", "1", "--jobs", "2", "--rendered", "0")
+    status, _, errors = run_command_line(*words)
+    assert (status, was_run.exists()) == (0, False), errors
+    assert "PYTHONSAFEPATH" not in os.environ  # which the command has for these processes alone
 
 
 @needs_others
-@pytest.mark.parametrize("name", [".numba_config.yaml", "matplotlibrc"])
-def test_settings_of_libraries_that_another_user_has_put_there_are_not_obeyed(tmp_path, monkeypatch, name):
+@pytest.mark.parametrize(
+    ("name", "commands"),
+    [(".numba_config.yaml", [USES_NUMBA, [STARHIL, "unit", "list"]]), ("matplotlibrc", [[STARID, "--help"]])],
+    ids=[".numba_config.yaml", "matplotlibrc"],
+)
+def test_settings_of_libraries_that_another_user_has_put_there_are_not_obeyed(
+    tmp_path, monkeypatch, name, commands
+):
     """With `chrome_trace`, numba replaced any file of the user by a trace."""
     settings, precious = tmp_path / name, tmp_path / "precious"
     settings.write_text(f"chrome_trace: {precious}\n")
     precious.write_text("precious")
     monkeypatch.chdir(tmp_path)
-    uses_numba = [sys.executable, "-P", "-c", "import starid.kernels.jit"]
-    commands = [
-        [installed_command(), "unit", "list"],
-        [str(Path(installed_command()).with_name("starid")), "--help"],
-    ]
     os.chown(settings, OTHER_USER, OTHER_USER)
-    for command in [uses_numba, *commands]:
+    for command in commands:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 1
         assert re.search(
             rf"{re.escape(str(settings))}: belongs to user 12345, and \w+ would obey it", done.stderr
         )
         assert precious.read_text() == "precious"
-    for command in commands:
-        os.chown(settings, os.geteuid(), -1)
-        assert subprocess.run(command, capture_output=True, check=False).returncode == 0
+    os.chown(settings, os.geteuid(), -1)
+    assert subprocess.run(commands[-1], capture_output=True, check=False).returncode == 0

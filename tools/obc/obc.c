@@ -13,7 +13,9 @@
 #define CYCLE_MS 200u   /* five readings per second */
 #define DEADLINE_MS 50u /* a later reply is late */
 #define SILENCE_MS 1000u /* after which a reply is missing */
+#ifndef LIMIT_MS
 #define LIMIT_MS 120000u
+#endif
 #define WANTED 25u
 #define UNIX_S 1774008000u /* 2026-03-20T12:00:00Z */
 #define CLOCK_HZ 25000000u
