@@ -13,8 +13,8 @@ virtual environment of this clone works unchanged. Files written by the guest ar
 folders named by --share. The command gets the caller's environment, working folder and arguments, but no
 standard input. Its output is passed on as it is written, and its exit status is returned.
 
-Other exit statuses: 2 for a wrong call, 69 if a package is missing, 124 after a timeout, 125 if the guest did
-not start or died (its console is printed then). Root is not needed. Requires the Debian packages of
+Other exit statuses: 2 for a wrong call, 69 if a package is missing or the guest does not boot, 124 after a timeout,
+125 if the guest died (its console is printed then). Root is not needed. Requires the Debian packages of
 `tools/install_test_packages vcan uml` or `vcan qemu`. Uses only the standard library and leaves no files.
 """
 
@@ -94,7 +94,7 @@ def run_in_guest(
     Raises
     ------
     GuestError
-        A package is missing, the command timed out, or the guest did not boot.
+        A package is missing, the guest did not boot or died, or the command timed out.
     """
     listing = [str(Path(__file__).with_name("install_test_packages")), "--list", "vcan", machine]
     if missing := subprocess.run(listing, stdout=subprocess.PIPE, text=True, check=True).stdout.strip():
@@ -128,7 +128,8 @@ def run_in_guest(
                 streams = [stack.enter_context(piped_to(stream)) for stream in (sys.stdout, sys.stderr)]
                 kernel = qemu_command(init, folder, memory, streams, job["shares"])
             over = boot(kernel, folder, console_file, streams, time_out_s=time_out_s)
-        if over and (folder / STARTED_FILE).exists():
+        started = (folder / STARTED_FILE).exists()
+        if over and started:
             raise GuestError(
                 f"the guest was ended after {time_out_s:g} s: {shlex.join(command)}", EXIT_TIME_OUT
             )
@@ -137,7 +138,8 @@ def run_in_guest(
         except (FileNotFoundError, ValueError):
             text = console.read_text(encoding="utf-8", errors="replace")
             raise GuestError(
-                f"{machine}: the guest did not run the command; its console:\n{text}", EXIT_GUEST_FAILED
+                f"{machine}: the guest did not run the command; its console:\n{text}",
+                EXIT_GUEST_FAILED if started else EXIT_UNAVAILABLE,
             ) from None
 
 
@@ -407,12 +409,9 @@ def main() -> int:
     parser.add_argument("--share", action="append", default=[], type=Path, help="folder that stays writable")
     parser.add_argument("--time-out", type=float, default=300.0, metavar="SECONDS", help="default 300")
     parser.add_argument("--memory", default="3G", help="of the guest, default 3G")
-    parser.add_argument("--check", action="store_true", help="only report whether a guest is available")
     parser.add_argument("command", nargs=argparse.REMAINDER, metavar="COMMAND")
     arguments = parser.parse_args()
     command = arguments.command[1:] if arguments.command[:1] == ["--"] else arguments.command
-    if arguments.check:
-        command = ["ip", "link", "show", "vcan0"]
     if not command:
         parser.error("missing command")
     for share in arguments.share:

@@ -17,9 +17,10 @@ GUEST = """
 import os, sys
 machine = sys.argv[sys.argv.index("--machine") + 1]
 if machine not in os.environ["BOOTS"].split():
-    sys.exit(f"{machine}: ptrace set fp regs failed\\n")
-if "--check" not in sys.argv:
-    print("ran in", machine)
+    print(f"{machine}: ptrace set fp regs failed\\n", file=sys.stderr)
+    sys.exit(69)
+print("ran in", machine)
+sys.exit(int(os.environ.get("STATUS", "0")))
 """
 SETTING = "REQUIRE_VCAN0"  # a test states it if it is about it
 NO_GUEST = "no guest: uml: uml: ptrace set fp regs failed; qemu: qemu: ptrace set fp regs failed"
@@ -61,6 +62,10 @@ def run(tmp_path):
 @pytest.mark.parametrize(("boots", "said"), [("uml qemu", "ran in uml"), ("qemu", "ran in qemu")])
 def test_the_first_guest_that_boots_is_taken(run, boots, said):
     assert run(boots) == (0, said)
+
+
+def test_the_status_is_that_of_the_tests(run):
+    assert run("uml qemu", STATUS="5") == (5, "ran in uml")
 
 
 def test_where_no_guest_boots_the_reasons_are_kept(run, tmp_path):
