@@ -261,24 +261,31 @@ def replies(step: Callable[[np.void], object], port: str) -> list[dict[str, obje
     return values
 
 
-def test_an_obc_reads_the_same_as_beside_a_simulator_that_speaks_to_the_feed(
+def test_an_obc_reads_the_same_after_a_reset_and_beside_a_simulator_that_speaks_to_the_feed(
     fmu3: Path, tmp_path: Path
 ) -> None:
+    """At the end, the emulator dies, which ends the step."""
+    before, by_fmu, outputs = children(os.getpid(), "serve"), [], []
     link = tmp_path / "port"
     with unit_of(fmu3, tmp_path, serial="auto", symlink=str(link)) as unit:
-        unit.begin()
-        assert unit.get("ready").startswith("ready truth=tcp:")
-        by_fmu = replies(unit.step, str(link))
-        unit.slave.terminate()
-        wait_until(lambda: not link.is_symlink())
-    command = emulator_command(
-        profile=str(fmu3.parent / QUICK),
-        serial="auto",
-        can="off",
-        seed=1,
-        settings=LOCK_STEP,
-    )
-    with EmulatorThread(command) as emulator:
+        for turn in range(2):
+            if turn:
+                unit.slave.reset()
+                wait_until(lambda: not link.is_symlink())
+                assert unit.get("frame") == 0
+                unit.set("serial", "auto")  # a parameter can be set again
+                unit.set("symlink", str(link))
+            unit.begin()
+            unit.time = 0.0
+            assert unit.get("ready").startswith("ready truth=tcp:")
+            by_fmu.append(replies(unit.step, str(link)))
+            outputs.append([unit.get(name) for name in OUTPUTS])
+        assert outputs[0] == outputs[1]
+        assert outputs[0][OUTPUTS.index("valid")]
+        dies(unit, before)
+    with EmulatorThread(
+        emulator_command(profile=str(fmu3.parent / QUICK), can="off", seed=1, settings=LOCK_STEP)
+    ) as emulator:
         host, port = emulator.ready["truth"].removeprefix("tcp:").split(":")
         with socket.create_connection((host, int(port))) as feed, feed.makefile("rw") as lines:
 
@@ -288,8 +295,27 @@ def test_an_obc_reads_the_same_as_beside_a_simulator_that_speaks_to_the_feed(
                 lines.flush()
                 assert json.loads(lines.readline())["ok"]
 
-            assert replies(step, emulator.ready["serial"]) == by_fmu
-    assert by_fmu[-1]["valid"]
+            assert [replies(step, emulator.ready["serial"])] * 2 == by_fmu
+    assert by_fmu[0][-1]["valid"]
+
+
+def dies(unit: Unit, before: list[int]) -> None:
+    """An emulator that dies ends the step with a message; `before` are the processes of other FMUs."""
+    row = tumble(unit.time)[-1]
+    (process,) = set(children(os.getpid(), "serve")) - set(before)
+    (emulator,) = children(process, "truth.lockstep")
+    os.kill(emulator, signal.SIGKILL)
+    time = unit.time
+    with refused("fmi3DoStep"):
+        unit.step(row)
+    assert re.search(
+        rf"inputs at {time:g} s: .*; the emulator ended (unexpectedly )?with status -9", unit.messages[-1]
+    )
+    with refused("fmi3DoStep"):
+        unit.step(row)
+    assert (
+        unit.messages[-1] == f"step at {time:g} s: the simulation has ended; reset the FMU to begin another"
+    )
 
 
 def test_it_connects_to_an_emulator_that_runs_and_leaves_it_running(fmu3: Path, tmp_path: Path) -> None:
@@ -304,22 +330,6 @@ def test_it_connects_to_an_emulator_that_runs_and_leaves_it_running(fmu3: Path, 
             channel.connect(running["control"].removeprefix("unix:"))
             channel.sendall(b'{"do": "status"}\n')
             assert json.loads(channel.recv(4096))["ok"]
-
-
-def test_reset_begins_again_with_the_same_outputs(fmu3: Path, tmp_path: Path) -> None:
-    values = []
-    with unit_of(fmu3, tmp_path) as unit:
-        for _ in range(2):
-            unit.begin()
-            unit.time = 0.0
-            for row in tumble(2.5):
-                unit.step(row)
-            values.append([unit.get(name) for name in OUTPUTS])
-            unit.slave.reset()
-            assert unit.get("frame") == 0
-            unit.set("serial", "off")  # a parameter can be set again
-    assert values[0] == values[1]
-    assert values[0][OUTPUTS.index("valid")]
 
 
 def test_signals_of_the_host_do_not_disturb_a_step(tumbling: tuple[Unit, Iterator[np.void]]) -> None:
@@ -337,26 +347,6 @@ def test_signals_of_the_host_do_not_disturb_a_step(tumbling: tuple[Unit, Iterato
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
     assert len(values) > 20
-
-
-def test_an_emulator_that_dies_ends_the_step_with_a_message(fmu3: Path, tmp_path: Path) -> None:
-    before = children(os.getpid(), "serve")
-    link = tmp_path / "port"
-    with unit_of(fmu3, tmp_path, serial="auto", symlink=str(link)) as unit:
-        unit.begin()
-        rows = tumble(1.0)
-        unit.step(rows[0])
-        (process,) = set(children(os.getpid(), "serve")) - set(before)
-        (emulator,) = children(process, "truth.lockstep")
-        os.kill(emulator, signal.SIGKILL)
-        with refused("fmi3DoStep"):
-            unit.step(rows[1])
-        assert re.search(
-            r"inputs at 0.1 s: .*; the emulator ended (unexpectedly )?with status -9", unit.messages[-1]
-        )
-        with refused("fmi3DoStep"):
-            unit.step(rows[2])
-        assert unit.messages[-1] == "step at 0.1 s: the simulation has ended; reset the FMU to begin another"
 
 
 def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> None:

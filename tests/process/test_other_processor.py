@@ -28,6 +28,8 @@ ARM64 = os.environ.get("ARM64_ROOT", "").split()
 AT_NIGHT = pytest.mark.skipif(not ARM64, reason="make arm64 runs it")
 
 SCRIPT = """
+import gc
+gc.disable()  # compiling makes many objects and little garbage
 import hashlib
 import numpy as np
 from starhil.emulator.sensor.model import SensorModel

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
+import io
 import re
+import runpy
 import signal
 import socket
 import subprocess
 import sys
 import threading
 from pathlib import Path
+from unittest import mock
 
 import pytest
 
@@ -53,8 +57,8 @@ def start(folder: Path, *command: str) -> subprocess.Popen[str]:
     )  # fmt: skip
 
 
-def printed(program: subprocess.Popen[str]) -> dict[str, list[float]]:
-    """Wait for the end of a program; return the numbers that it prints by the text before them."""
+def ended(program: subprocess.Popen[str]) -> dict[str, list[float]]:
+    """Wait for the end of a program; return what it prints."""
     with program:
         try:
             output, errors = program.communicate(timeout=PATIENCE_S)
@@ -62,6 +66,23 @@ def printed(program: subprocess.Popen[str]) -> dict[str, list[float]]:
             program.kill()
             raise
     assert program.returncode == 0, errors
+    return figures_of(output)
+
+
+def run_here(folder: Path, *command: str) -> dict[str, list[float]]:
+    """Run a program in this process, which has imported most of what it needs; return what it prints."""
+    output = io.StringIO()
+    with (
+        contextlib.chdir(folder),
+        mock.patch.object(sys, "argv", [*command]),
+        contextlib.redirect_stdout(output),
+    ):
+        runpy.run_path(command[0], run_name="__main__")
+    return figures_of(output.getvalue())
+
+
+def figures_of(output: str) -> dict[str, list[float]]:
+    """Return the numbers in a text by the words before them in their line."""
     lines = [re.match(r"(\D+?):? *([-\d].*|\[.*)$", line) for line in output.splitlines()]
     return {
         line[1]: [float(number) for number in re.findall(r"\d+(?:\.\d+)?", line[2])] for line in lines if line
@@ -80,7 +101,7 @@ def test_basilisk_in_lock_step(tmp_path):
     command = emulator_command(profile=str(tmp_path / "basilisk.toml"), settings=NO_IMAGES)
     with EmulatorThread(command) as emulator:
         write_files(tmp_path, "orbit.py", port=port, serial=emulator.ready["serial"])
-        figures = printed(start(tmp_path, "orbit.py", "60"))
+        figures = run_here(tmp_path, "orbit.py", "60")
     assert figures["attitudes read"][0] > 56
     assert figures["largest error of the rate"][0] < 0.01
     assert figures["within"][1] >= 99.7
@@ -99,9 +120,9 @@ def test_basilisk_in_real_time(tmp_path):
     with EmulatorThread(command) as emulator:
         write_files(tmp_path, "orbit.py", "obc.py", port=port, serial=emulator.ready["serial"])
         obc = start(tmp_path, "obc.py")
-        assert printed(start(tmp_path, "orbit.py", "6", "--real-time")) == {}
+        assert ended(start(tmp_path, "orbit.py", "6", "--real-time")) == {}
         obc.send_signal(signal.SIGINT)
-        figures = printed(obc)
+        figures = ended(obc)
     assert figures["attitudes read"][0] >= 3
     assert figures["largest error of the attitude"][0] < 20.0
 
@@ -141,7 +162,7 @@ def test_42_in_lock_step_and_its_recording(tmp_path):
             write_files(tmp_path, "obc.py", serial=emulator.ready["serial"])
             simulator = threading.Thread(target=send_as_42, args=(server, blocks_of_42(201)), daemon=True)
             simulator.start()
-            figures = printed(start(tmp_path, "obc.py"))
+            figures = run_here(tmp_path, "obc.py")
             simulator.join(PATIENCE_S)
             assert not simulator.is_alive()
     assert len((tmp_path / "truth.csv").read_text().splitlines()) == 21
@@ -163,6 +184,6 @@ def test_two_heads_on_one_bus(tmp_path):
             assert emulator.ready["can.2"] == emulator.ready["can"] == bus
             assert emulator.ready["seed.2"] != emulator.ready["seed"]
             write_files(tmp_path, "heads.py", can=bus, control=str(control))
-            figures = printed(start(tmp_path, "heads.py"))
+            figures = run_here(tmp_path, "heads.py")
     assert figures["attitudes read"] == [30.0, 30.0]
     assert figures["the two heads agree on the body within"][0] < 20.0
