@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -32,10 +32,8 @@ from starhil.emulator.sensor.renderer import render
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.truth.csv_file import BOUNDS
 from starhil.emulator.truth.source import TruthStatus
-from starhil.hil_tests.client.raw_traffic import parse_frame
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.rig.private_can_bus import hub_thread, private_can_bus
-from starhil.protocol.can.cubespace import MessageType
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.export import export
@@ -45,33 +43,12 @@ from starid.camera import Camera
 from starid.catalog import load_catalog
 from tests.emulator.cli.command_line import run_command_line
 from tests.process.conftest import NO_IMAGES, NO_IMAGES_OPTIONS
+from tests.typed_pages import DOCS, PAGES, UNASKED, Block, assert_shown, blocks
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.long
 
-DOCS = Path(__file__).parents[1] / "docs"
-UNASKED = {0x0CE60401, 0x185}
-"""Unsolicited telemetry, and the status that a change of mode sends: they may come between any two frames."""
-_FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _NUMBER = re.compile(r"-?(?:(?<!\.)\b[0-9A-F]{2}\b(?!\.)|\d+(?:\.\d+)?)")
-
-
-@dataclass(frozen=True)
-class Block:
-    """A fenced block: its language, its text, the heading that it stands under."""
-
-    language: str
-    text: str
-    heading: str
-
-
-def blocks(name: str, language: str = "") -> list[Block]:
-    text = (DOCS / name).read_text(encoding="utf-8")
-    return [
-        Block(match[1], match[2], re.findall(r"^#+ (.*)$", text[: match.start()], re.MULTILINE)[-1])
-        for match in _FENCE.finditer(text)
-        if language in ("", match[1])
-    ]
 
 
 def programs(name: str) -> list[tuple[Block, str]]:
@@ -382,108 +359,6 @@ def test_walkthrough_decodes_the_attitude():
 )
 def test_walkthrough_program(heading, unit, tmp_path):
     check_program(heading, unit, tmp_path)
-
-
-@dataclass(frozen=True)
-class Exchange:
-    """A frame that the walk-through sends with cansend, and the frames that it shows as the answer."""
-
-    typed: str
-    sent: CanFrame
-    answers: list[CanFrame]
-
-
-def exchanges(headings: set[str]) -> list[Exchange]:
-    links = []
-    for block in blocks("walkthrough.md"):
-        if block.language != "console" or block.heading not in headings:
-            continue
-        for part in block.text.split("$ cansend vcan0 ")[1:]:
-            typed, *dump = part.splitlines()
-            seen = [dumped(line) for line in dump]
-            assert str(seen[0]) == typed, "candump shows another frame than cansend sent"
-            links.append(Exchange(f"cansend vcan0 {typed}", seen[0], seen[1:]))
-    return links
-
-
-def dumped(line: str) -> CanFrame:
-    channel, identifier, size, *data = line.split()
-    frame = CanFrame(int(identifier, 16), bytes.fromhex("".join(data)), extended=len(identifier) == 8)
-    assert (channel, size) == ("vcan0", f"[{len(frame.data)}]")
-    return frame
-
-
-def fixed(frame: CanFrame) -> bytes:
-    """Return the part of a frame that does not depend on time and noise."""
-    if frame.extended:
-        kind = MessageType(frame.id >> 24)
-        measured = kind not in (MessageType.TELECOMMAND_NACK, MessageType.TELEMETRY_NACK)
-        acknowledge = frame.id >> 16 & 0xFF == 240
-        return b"" if measured and not acknowledge else frame.data
-    if frame.id == 0x585:
-        read = frame.data[0] & 0xE0 == 0x40
-        return frame.data[:4] if read else frame.data
-    return b""
-
-
-@dataclass(frozen=True)
-class TypedPage:
-    """What a page has its reader type: the start of the emulator, candump, and the frames that are exchanged."""
-
-    run: str
-    candump: str
-    exchanges: list[Exchange]
-
-
-def typed_page(lines: list[str], found: list[Exchange]) -> TypedPage:
-    (run,) = (line for line in lines if line.startswith("starhil run"))
-    (candump,) = (line.removesuffix(" &") for line in lines if line.startswith("candump"))
-    return TypedPage(run, candump, found)
-
-
-def readme_page() -> TypedPage:
-    text = (DOCS.parent / "README.md").read_text(encoding="utf-8")
-    section = text[text.index("**SocketCAN**") : text.index("**Where the kernel has no CAN**")]
-    lines = [line.strip() for line in section.splitlines() if line.startswith("    ")]
-    typed = [line for line in lines if line.startswith("cansend")]
-    # it shows no answers: identification, acknowledge, quaternion
-    answers = [CanFrame(0x05800401, bytes(8)), CanFrame(0x02600401), CanFrame(0x05E60401, bytes(6))]
-    return typed_page(
-        lines,
-        [
-            Exchange(line, parse_frame(line.split()[2]), [answer])
-            for line, answer in zip(typed, answers, strict=True)
-        ],
-    )
-
-
-def walkthrough_page(heading: str, parts: set[str], count: int) -> TypedPage:
-    (start,) = (b for b in blocks("walkthrough.md", language="sh") if b.heading == heading)
-    text = (DOCS / "walkthrough.md").read_text(encoding="utf-8")
-    filtered = re.findall(r"`(candump vcan0,\S+)`", text) if "--canopen" in start.text else []
-    found = exchanges(parts)
-    assert len(found) == count
-    return typed_page([*start.text.splitlines(), *filtered], found)
-
-
-PAGES = {
-    "README": readme_page(),
-    "CAN": walkthrough_page(
-        "1. CAN with can-utils",
-        {"Identification", "Mode and attitude", "Unsolicited telemetry", "Refusals"},
-        10,
-    ),
-    "CANopen": walkthrough_page("2. CANopen", {"With cansend"}, 3),
-}
-
-
-def assert_shown(frame: CanFrame, shown: CanFrame, typed: str) -> None:
-    """Compare a frame with the one that a page shows, but for what depends on time and noise."""
-    assert (str(frame).partition("#")[0], len(frame.data)) == (
-        str(shown).partition("#")[0],
-        len(shown.data),
-    ), typed
-    assert fixed(frame) == fixed(shown), typed
 
 
 @pytest.mark.process

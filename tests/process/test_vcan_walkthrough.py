@@ -19,7 +19,7 @@ import pytest
 
 from tests.emulator.emulator_thread import EmulatorThread
 from tests.process.conftest import NO_IMAGES_OPTIONS, needs_vcan0
-from tests.test_docs import PAGES, UNASKED, TypedPage, assert_shown, dumped
+from tests.typed_pages import PAGES, UNASKED, TypedPage, assert_shown, dumped
 from tests.waiting import PATIENCE_S
 
 pytestmark = [pytest.mark.process, pytest.mark.socketcan, needs_vcan0]
