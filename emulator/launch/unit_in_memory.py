@@ -18,7 +18,6 @@ from starhil.emulator.device.device import PIPELINE_ENDED
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch.emulator import Emulator, RunOptions
-from starhil.emulator.launch.simulated_loop import WORKER_WAIT_S
 from starhil.emulator.links.table import LINKS
 from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
@@ -49,6 +48,8 @@ STATE_FOLDER: Final = "state"
 LONGEST_STANDSTILL_S: Final = 120.0
 """Wall time for which the successor of a killed pipeline may use no processor time before it is ready, seconds; a busy machine
 may let it wait, but not for so long."""
+RESTART_LOOK_S: Final = 0.01
+"""Wall time between two looks at a pipeline that is restarted, seconds; at each, processes and the event loop have their turn."""
 RESTARTING_STEP_S: Final = 0.1
 """Longest step while the pipeline is restarted, whose pauses are of the event loop, seconds."""
 TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
@@ -307,8 +308,8 @@ class UnitUnderTest:
                     spent, since_s = now_spent, time.monotonic()
                 if time.monotonic() - since_s > LONGEST_STANDSTILL_S:
                     return False
-                await asyncio.sleep(WORKER_WAIT_S)
-                time.sleep(WORKER_WAIT_S)
+                await asyncio.sleep(RESTART_LOOK_S)
+                time.sleep(RESTART_LOOK_S)
         return True
 
     def set_disk(self, *, full: bool) -> None:

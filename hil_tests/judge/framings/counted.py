@@ -41,10 +41,28 @@ class Counted:
     def take(self, received: bytearray, measure: Measure) -> Taken | None:
         """Remove a message that must begin at once; a byte of the range that is not stuffed makes it junk."""
         check_start(received, self.start)
-        body, position = bytearray(), len(self.start)
+        found = self._body(bytes(received[len(self.start) :]), measure)
+        if found is None:
+            return None
+        body, size = found
+        position = len(self.start) + size
+        whole = position + len(self.end)
+        if len(received) < whole:
+            return None
+        if bytes(received[position:whole]) != self.end:
+            raise ValueError(f"no end {self.end.hex()} after {len(body)} bytes")
+        del received[:whole]
+        return Taken(body)
+
+    def _body(self, begun: bytes, measure: Measure) -> tuple[bytes, int] | None:
+        """Return the body with which bytes begin, and the number of bytes that it takes; None if it is incomplete."""
+        if not self._pairs:
+            size = measure(begun)
+            return None if size is None or len(begun) < size else (begun[:size], size)
+        body, position = bytearray(), 0
         size = measure(b"")
         while size is None or len(body) < size:
-            pair = bytes(received[position : position + 2])
+            pair = begun[position : position + 2]
             if not pair or (pair[0] == self._escape and len(pair) < 2):
                 return None
             if pair[0] in self._pairs and pair not in self._originals:
@@ -52,10 +70,4 @@ class Counted:
             body.append(self._originals.get(pair, pair[0]))
             position += 2 if pair in self._originals else 1
             size = measure(bytes(body)) if size is None else size
-        whole = position + len(self.end)
-        if len(received) < whole:
-            return None
-        if bytes(received[position:whole]) != self.end:
-            raise ValueError(f"no end {self.end.hex()} after {size} bytes")
-        del received[:whole]
-        return Taken(bytes(body))
+        return bytes(body), position

@@ -10,7 +10,7 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from itertools import chain, pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -43,12 +43,14 @@ from starhil.protocol.files.bundled import bundled_units
 from starhil.protocol.icd.codec import Row
 from starhil.protocol.unit import load_unit
 from tests.emulator.cli.command_line import run_command_line
+from tests.emulator.conftest import FakePipeline
+from tests.emulator.runs import FakeImager
 from tests.planted import PlantedDefect, read_defects
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.long
 
-LIVES, STEPS = 2, 150
+LIVES, STEPS = 2, 80
 """Of each unit; `make years` has many more."""
 ROOT = Path(__file__).parents[3]
 MUTANTS = read_defects(Path(__file__).with_name("mutants.toml"), PlantedDefect)
@@ -60,20 +62,26 @@ def life_of(unit, seed, steps=STEPS):
     return make_life(unit_of(icd), unit, links_of(icd), seed, steps)
 
 
+@cache
+def outcome_of(unit, seed):
+    return run_once(life_of(unit, seed))
+
+
 @pytest.mark.parametrize("unit", sorted(bundled_units()))
 def test_no_life_ends_in_a_violation(unit):
-    outcomes = [run_once(life_of(unit, seed)) for seed in range(1, LIVES + 1)]
+    outcomes = [outcome_of(unit, seed) for seed in range(1, LIVES + 1)]
     assert [outcome.violation for outcome in outcomes] == [""] * LIVES
-    assert sum(outcome.readings for outcome in outcomes) > 20
-    assert sum(outcome.device_s for outcome in outcomes) > 3600.0
+    assert sum(outcome.readings for outcome in outcomes) > 10
+    assert sum(outcome.device_s for outcome in outcomes) > 1800.0
 
 
 def test_a_life_whose_images_are_rendered_ends_without_a_violation():
-    outcome = run_once(replace(life_of("sagitta", 5, 25), rendered=True))
+    outcome = run_once(replace(life_of("sagitta", 5, 8), rendered=True))
     assert outcome.violation == ""
+    assert outcome.attitudes > 0
 
 
-def test_a_rendering_process_that_is_killed_is_an_error_until_its_successor_is_ready():
+def test_a_rendering_process_that_is_killed_is_an_error_until_its_successor_is_ready_also_on_a_full_disk():
     steps = (
         {"do": "wait", "s": 3.0},
         READ_MODE,
@@ -81,19 +89,17 @@ def test_a_rendering_process_that_is_killed_is_an_error_until_its_successor_is_r
         READ_MODE,
         {"do": "wait", "s": 3.0},
         READ_MODE,
+        {"do": "disk", "full": True},
+        {"do": "end_pipeline"},
+        READ_MODE,
     )
     outcome = run_once(Life("cubestar", 1, ("serial",), {}, steps, rendered=True))
-    assert (outcome.violation, outcome.readings) == ("", 3)
-
-
-def test_a_rendering_process_has_a_successor_while_no_file_can_be_written():
-    steps = ({"do": "disk", "full": True}, {"do": "end_pipeline"}, READ_MODE)
-    outcome = run_once(Life("cubestar", 1, ("serial",), {}, steps, rendered=True))
-    assert (outcome.violation, outcome.readings) == ("", 1)
+    assert (outcome.violation, outcome.readings) == ("", 4)
 
 
 def test_a_pipeline_that_is_given_up_is_a_violation_of_its_life_alone(monkeypatch):
     monkeypatch.setattr(WorkerClient, "restart", AsyncMock(side_effect=EmulatorError("no process")))
+    monkeypatch.setattr(revival, "PAUSES_S", (0.1, 0.1))
     steps = ({"do": "end_pipeline"}, READ_MODE)
     outcome = run_once(Life("cubestar", 1, ("serial",), {}, steps, rendered=True))
     assert (outcome.violation, outcome.step) == ("the image pipeline has not been restarted", 0)
@@ -258,7 +264,7 @@ def test_a_value_that_the_object_dictionary_refuses_may_be_uncounted():
 
 
 def test_stars_are_compared_where_a_row_has_no_quaternion():
-    assert run_once(life_of("cubestar-gen2", 1)).attitudes > 0
+    assert outcome_of("cubestar-gen2", 2).attitudes > 0
 
 
 @pytest.mark.parametrize("start", [True, False])
@@ -323,7 +329,7 @@ def test_a_seed_gives_one_life_and_one_outcome_whatever_the_hash_seed_is():
     assert life_of("cubestar", 3) != life_of("cubestar", 4)
     program = (
         "from tests.hil_tests.endurance.test_endurance import life_of, run_once\n"
-        "print(life_of('cubestar', 3), run_once(life_of('oresat', 3)), sep='\\n')"
+        "print(life_of('cubestar', 3), run_once(life_of('oresat', 1)), sep='\\n')"
     )
     environment = {**os.environ, "PYTHONHASHSEED": "1"}
     elsewhere = subprocess.run(
@@ -334,9 +340,9 @@ def test_a_seed_gives_one_life_and_one_outcome_whatever_the_hash_seed_is():
         text=True,
         check=True,
     )
-    outcome = run_once(life_of("oresat", 3))
+    outcome = outcome_of("oresat", 1)
     assert elsewhere.stdout == f"{life_of('cubestar', 3)}\n{outcome}\n"
-    assert (outcome.violation, outcome.step) == ("", 149)
+    assert (outcome.violation, outcome.step) == ("", STEPS - 1)
 
 
 @pytest.mark.parametrize("kind", ["usual", "long", "rendered"])
@@ -386,6 +392,8 @@ def test_an_interrupted_run_prints_the_lives_that_have_ended(monkeypatch):
 
 
 def test_a_life_in_a_file_is_repeated_as_it_was(tmp_path, monkeypatch):
+    imager = FakeImager(FakePipeline().handle)
+    monkeypatch.setattr("starhil.emulator.run.run.make_pipeline", lambda *_, **__: imager)
     life = Life("cubestar", 1, ("serial",), {}, (READ_MODE,), rendered=True)
     file, *_, recording = write_life(life, "a violation", tmp_path)
     assert read_life(file) == life
@@ -541,7 +549,7 @@ def test_a_life_with_a_full_disk_is_written_without_a_recording(tmp_path):
 
 
 def test_the_recording_of_a_life_is_repeated_to_the_byte(tmp_path):
-    life = life_of("sagitta", 7, 60)
+    life = life_of("sagitta", 7, 30)
     life = replace(life, steps=tuple(step for step in life.steps if step["do"] not in UNRECORDED_STEPS))
     outcome = run_once(life, record=tmp_path / "recording")
     assert outcome.violation == ""
@@ -653,9 +661,9 @@ def test_a_life_of_a_unit_without_telecommands_reads_it(tmp_path):
         'reply_header = [{ role = "id", type = "u8" }, { role = "status", type = "u8" }]\n'
     )
     icd = load_unit(tmp_path)
-    life = make_life(unit_of(icd), str(tmp_path), links_of(icd), 4, 200)
+    life = make_life(unit_of(icd), str(tmp_path), links_of(icd), 4, 60)
     sent = [step for step in life.steps if step["do"] == "request"]
-    assert sum(step["row"] == ["", 2, "telemetry"] for step in sent) > 20
+    assert sum(step["row"] == ["", 2, "telemetry"] for step in sent) > 6
     assert "nmt" not in {step["do"] for step in life.steps}
     outcome = run_once(life)
     assert outcome.violation == ""

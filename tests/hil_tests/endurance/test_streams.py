@@ -56,7 +56,7 @@ def outcome_of(folder, *steps, start_mode="standby"):
 @pytest.mark.parametrize(("number", "variant"), list(enumerate(VARIANTS)))
 def test_no_life_of_the_unit_of_the_tutorial_ends_in_a_violation(units, number, variant):
     unit = read_unit(units[variant])
-    seeds = range(number, 21, len(VARIANTS))
+    seeds = range(number, 12, len(VARIANTS))
     lives = [make_life(unit, variant, ("serial",), seed, 60) for seed in seeds]  # whatever the folder is
     outcomes = [run_once(replace(life, unit=str(units[variant]))) for life in lives]
     assert [outcome.violation for outcome in outcomes] == [""] * len(lives)
@@ -106,7 +106,7 @@ def test_lives_of_a_unit_whose_telemetry_cannot_be_requested_end_without_a_viola
     folder = user_unit(tmp_path / "unit", PACKETS.replace("LENGTH", "u16"))
     unit = read_unit(folder)
     assert not unit.readable
-    lives = [make_life(unit, "packets", ("serial",), seed, 40) for seed in range(4)]
+    lives = [make_life(unit, "packets", ("serial",), seed, 40) for seed in range(2)]
     outcomes = [run_once(replace(life, unit=str(folder))) for life in lives]
     assert [outcome.violation for outcome in outcomes] == [""] * len(lives)
     assert sum(outcome.readings for outcome in outcomes) > 1000
