@@ -1,8 +1,10 @@
-"""Files written and read by Orekit, in a process of its own, because it runs a Java machine.
+"""Files written and read by Orekit, in a process of its own, because it runs a Java machine, which starts once.
 
-`orekit_files.py write FOLDER`: AEMs of versions 1 and 2, as KVN and XML, of the rows in FOLDER/rows.json.
-`orekit_files.py read FILE`: the matrices ICRS→body and rates of an AEM, one row per line, as JSON.
-`orekit_files.py ephemeris FILE START T …`: position and velocity, m, m/s, by an STK ephemeris at seconds from a date, as JSON lines.
+`orekit_files.py FOLDER` keeps a file for Orekit in the folder, and reads a list on each line of its input, as JSON:
+`["write", FOLDER]`: AEMs of versions 1 and 2, as KVN and XML, of the rows in FOLDER/rows.json;
+`["read", FILE]`: the matrices ICRS→body and rates of an AEM;
+`["ephemeris", FILE, START, T …]`: position and velocity, m, m/s, by an STK ephemeris at seconds from a date.
+It answers each with a line, a list of rows as JSON.
 """
 
 import json
@@ -45,7 +47,7 @@ def leap_seconds(folder: Path) -> None:
     DataContext.getDefault().getDataProvidersManager().addProvider(DirectoryCrawler(File(str(folder))))
 
 
-def write(folder: Path) -> None:
+def write(folder: Path) -> list[object]:
     rows = json.loads((folder / "rows.json").read_text())
     epoch = AbsoluteDate(rows["start"], TimeScalesFactory.getUTC())
     gcrf, j2000 = FramesFactory.getGCRF(), FramesFactory.getEME2000()
@@ -89,11 +91,13 @@ def write(folder: Path) -> None:
             writer.writeMessage(generator, aem)
             generator.close()
             (folder / f"v{version:.0f}.{suffix}").write_text(str(text))
+    return []
 
 
-def read(path: Path) -> None:
+def read(path: Path) -> list[object]:
     aem = ParserBuilder().buildAemParser().parseMessage(DataSource(str(path)))
     gcrf = FramesFactory.getGCRF()
+    rows: list[object] = []
     for block in aem.getSegments():
         frame = block.getReferenceFrame()
         for each in block.getAngularCoordinates():
@@ -101,24 +105,29 @@ def read(path: Path) -> None:
             matrix = [[float(value) for value in row] for row in turn.getMatrix()]
             rate = [float(value) for value in each.getRotationRate().toArray()]
             date = str(each.getDate().toString(TimeScalesFactory.getUTC()))
-            print(json.dumps({"date": date, "matrix": matrix, "rate": rate}))
+            rows.append({"date": date, "matrix": matrix, "rate": rate})
+    return rows
 
 
-def ephemeris(path: Path) -> None:
+def ephemeris(path: Path, start: str, *times: str) -> list[object]:
     """Of two segments that share a time, the later one holds."""
     utc, gcrf = TimeScalesFactory.getUTC(), FramesFactory.getGCRF()
     frames = HashMap()
     frames.put(STKEphemerisFile.STKCoordinateSystem.ICRF, gcrf)
     parser = STKEphemerisFileParser("x", 3.986004418e14, utc, frames)
     segments = list(parser.parse(DataSource(str(path))).getSatellites().get("x").getSegments())
-    epoch = AbsoluteDate(sys.argv[3], utc)
-    for t in map(float, sys.argv[4:]):
+    epoch = AbsoluteDate(start, utc)
+    rows: list[object] = []
+    for t in map(float, times):
         date = epoch.shiftedBy(t)
         segment = [each for each in segments if each.getStart().compareTo(date) <= 0][-1]
         state = segment.getPropagator().getPVCoordinates(date, gcrf)
-        print(json.dumps([float(x) for v in (state.getPosition(), state.getVelocity()) for x in v.toArray()]))
+        rows.append([float(x) for v in (state.getPosition(), state.getVelocity()) for x in v.toArray()])
+    return rows
 
 
-what, path = sys.argv[1], Path(sys.argv[2])
-leap_seconds(path if path.is_dir() else path.parent)
-{"write": write, "read": read, "ephemeris": ephemeris}[what](path)
+leap_seconds(Path(sys.argv[1]))
+for line in sys.stdin:
+    what, path, *others = json.loads(line)
+    rows = {"write": write, "read": read, "ephemeris": ephemeris}[what](Path(path), *others)
+    print(json.dumps(rows), flush=True)

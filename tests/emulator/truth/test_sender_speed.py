@@ -92,7 +92,7 @@ def arrivals(kind, count, rng):
 )
 def test_delays_and_clocks_that_slip_are_no_other_speed(kind, caplog):
     live = LiveTruth(START, stale_s=1.0)
-    for n, received in enumerate(arrivals(kind, 1000, np.random.default_rng(7)).tolist()):
+    for n, received in enumerate(arrivals(kind, 500, np.random.default_rng(7)).tolist()):
         send(live, 0.1 * n, received)
         assert live.state(received).status is not TruthStatus.WRONG_SPEED, (n, received)
     assert not warnings(caplog)

@@ -1,4 +1,4 @@
-"""A live feed whose clock is a little fast or slow is followed for minutes."""
+"""A live feed whose clock is a little fast or slow is followed for a minute."""
 
 import math
 
@@ -13,12 +13,12 @@ pytestmark = pytest.mark.long
 
 
 @pytest.mark.parametrize("with_rate", [True, False])
-@pytest.mark.parametrize("speed", [0.9, 0.97, 0.978, 0.999, 1.0, 1.001, 1.03, 1.1])
+@pytest.mark.parametrize("speed", [0.9, 0.978, 1.001, 1.1])
 def test_a_sender_whose_clock_slips_is_followed(speed, with_rate):
     live = LiveTruth(EAST, stale_s=1.0)
     rng = np.random.default_rng(1)
     worst_arcsec = worst_lag_s = 0.0
-    for n in range(1000):
+    for n in range(600):
         t = 0.1 * n
         received = t / speed + rng.exponential(0.002)
         truth = SLEW.state(t)

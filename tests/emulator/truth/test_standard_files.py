@@ -7,9 +7,6 @@ import importlib.util
 import io
 import json
 import math
-import shutil
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -27,7 +24,7 @@ from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
 from starid.catalog.earth import unix_time
 from tests.emulator.cli.command_line import run_command_line
-from tests.waiting import PATIENCE_S
+from tests.emulator.truth.conftest import Orekit
 
 SLEW = SlewTruth(
     Attitude.from_radec_roll(83.8, -1.2, 30.0),
@@ -93,11 +90,8 @@ def write(tmp_path: Path, text: str) -> Path:
 
 
 @pytest.fixture(scope="module")
-def orekit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(orekit: Orekit, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of files that Orekit has written."""
-    needs("orekit_jpype")
-    if shutil.which("java") is None:
-        pytest.skip("no java here (Debian package default-jre-headless)")
     folder = tmp_path_factory.mktemp("orekit")
     rows = {
         "start": START,
@@ -106,22 +100,15 @@ def orekit(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "rate": [state.rate_rad_s.tolist() for state in STATES],
     }
     (folder / "rows.json").write_text(json.dumps(rows))
-    run_orekit("write", folder)
+    assert orekit("write", folder) == []
     return folder
-
-
-def run_orekit(*arguments: object) -> str:
-    command = [sys.executable, Path(__file__).with_name("orekit_files.py"), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=PATIENCE_S)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 @pytest.mark.process
 @pytest.mark.parametrize("name", ["v1.kvn", "v1.xml", "v2.kvn", "v2.xml"])
-def test_an_aem_of_orekit_has_its_attitudes(orekit: Path, name: str) -> None:
+def test_an_aem_of_orekit_has_its_attitudes(written: Path, name: str) -> None:
     """They are in EME2000 and TAI there, the scalar first in version 1."""
-    truth = read_truth_file(orekit / name)
+    truth = read_truth_file(written / name)
     assert truth.start_unix_s == START_UNIX_S
     assert worst_arcsec(truth, TIMES) < MICROARCSECOND
     if name.startswith("v2"):
@@ -129,10 +116,10 @@ def test_an_aem_of_orekit_has_its_attitudes(orekit: Path, name: str) -> None:
 
 
 @pytest.mark.process
-def test_orekit_reads_a_written_aem(orekit: Path, tmp_path: Path) -> None:
+def test_orekit_reads_a_written_aem(orekit: Orekit, written: Path, tmp_path: Path) -> None:
     target = tmp_path / "out.aem"
-    assert run_command_line("truth", "convert", str(orekit / "v2.kvn"), "-o", str(target)) == (0, "", "")
-    rows = [json.loads(line) for line in run_orekit("read", target).splitlines()]
+    assert run_command_line("truth", "convert", str(written / "v2.kvn"), "-o", str(target)) == (0, "", "")
+    rows = orekit("read", target)
     assert len(rows) == len(TIMES)
     for row, state in zip(rows, STATES, strict=True):
         error = Attitude.from_matrix(row["matrix"]).error_to(state.attitude)
