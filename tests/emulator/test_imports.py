@@ -12,13 +12,7 @@ import starhil
 
 pytestmark = pytest.mark.process
 
-FOR_THE_WORKER = ("numba", "scipy", "sklearn", "cv2", "matplotlib", "erfa", "sgp4", "aiohttp", "mcap")
-
-
-def test_the_links_start_without_the_libraries_of_the_pipeline():
-    text = "import sys, starhil.emulator.launch; print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
-    assert not set(FOR_THE_WORKER) & set(done.stdout.split())
+FOR_THE_WORKER = {"numba", "scipy", "sklearn", "cv2", "matplotlib", "erfa", "sgp4", "aiohttp", "mcap"}
 
 
 PROFILES = sorted(
@@ -26,22 +20,22 @@ PROFILES = sorted(
 )
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-def test_a_profile_is_read_without_them(profile: str) -> None:
-    text = "import sys; from starhil.emulator.profile import load_profile; load_profile(sys.argv[1]); print(*sys.modules)"
-    done = subprocess.run([sys.executable, "-c", text, profile], capture_output=True, text=True, check=True)
-    assert not set(FOR_THE_WORKER) & set(done.stdout.split())
-
-
-def test_a_unit_without_images_and_distortion_runs_without_them() -> None:
-    text = """import sys
+def test_links_profiles_and_a_unit_without_images_do_without_the_libraries_of_the_pipeline() -> None:
+    """In one process, which prints after each step what has been imported."""
+    text = f"""import sys
+def found(step):
+    print(step, *{FOR_THE_WORKER} & sys.modules.keys())
+import starhil.emulator.launch
+found("launch")
 from starhil.emulator.profile import load_profile
+for name in {PROFILES}:
+    load_profile(name)
+    found(name)
 from starhil.emulator.profile.pipeline_setup import make_pipeline
-profile = load_profile("ideal", ["run.worker=error_model"])
-make_pipeline(profile, None, repeatable=False, previews=False)
-print(*sys.modules)"""
+make_pipeline(load_profile("ideal", ["run.worker=error_model"]), None, repeatable=False, previews=False)
+found("error_model")"""
     done = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
-    assert not set(FOR_THE_WORKER) & set(done.stdout.split())
+    assert done.stdout.splitlines() == ["launch", *PROFILES, "error_model"]
 
 
 def test_the_pipeline_starts_without_the_libraries_of_the_links() -> None:

@@ -58,7 +58,7 @@ def test_causes_are_those_that_were_put_there(device: OrbitDevice) -> None:
         "earth": replace(good, faults={"earth": {**centre, "radius_deg": 64.0}}),
         "rate": replace(good, truth=replace(good.truth, rate_rad_s=np.radians([0.0, 0.0, 0.0]) + 3.0)),
         "temperature": replace(good, temperature_c=120.0),
-        "particles": replace(good, particles_s=2e5),
+        "particles": replace(good, particles_s=4e4),
         STARS: replace(good, faults={"blank": True}),
         TOGETHER: replace(good, faults={"sun": centre}, temperature_c=120.0),
     }

@@ -61,7 +61,7 @@ def test_a_cell_with_marks_inside_is_printed_without_them(tmp_path: Path) -> Non
 def test_no_heading_is_the_last_of_its_page(below: str, lines: int, tmp_path: Path) -> None:
     Image.new("RGB", (640, 320)).save(tmp_path / "plot.png")
     page_counts = set()
-    for before in range(lines - 6, lines + 2):
+    for before in (lines - 6, lines, lines + 1):
         text = "# Title\n\n" + "line\n\n" * before + f"## Heading\n\n{below}\n"
         contents = pages(as_pdf(text, "title", tmp_path))
         page_counts.add(len(contents))

@@ -114,7 +114,7 @@ def test_particles_come_with_the_south_atlantic_anomaly(make_bench):
     )
     bench = make_bench(profile).start()
     bench.command("set_mode", mode="lost_in_space")
-    bench.step(86_400.0)
+    bench.step(43_200.0)
     rates = [request.particles_s for request in bench.pipeline.frames]
     assert min(rates) == pytest.approx(1.0, abs=1e-3)
     assert 50.0 < max(rates) <= 201.0

@@ -111,7 +111,7 @@ def test_every_corrupt_file_is_kept(tmp_path):
 
 
 @pytest.mark.long
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(junk=st.binary(max_size=300))
 def test_no_content_of_the_file_is_a_crash(tmp_path_factory, junk):
     folder = tmp_path_factory.mktemp("state")

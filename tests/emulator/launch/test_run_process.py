@@ -216,13 +216,6 @@ def test_a_covered_field_clears_the_validity_and_false_stars_do_not(stepped):
     assert stepped.read("precise_attitude")["valid"]
 
 
-def test_two_runs_of_one_seed_give_the_same_bytes(stepped):
-    assert len(stepped.first_bytes) > 2000
-    again = Emulator(*SEEDED)
-    assert first_bytes(again) == stepped.first_bytes
-    assert again.end()[0] == 0
-
-
 def test_the_real_clock_runs_by_itself_and_ends_on_sigint(tmp_path):
     log = tmp_path / "truth.csv"
     emulator = Emulator(
@@ -242,14 +235,6 @@ def test_the_real_clock_runs_by_itself_and_ends_on_sigint(tmp_path):
     assert math.isfinite(float(values["cross_boresight_arcsec"]))
 
 
-def test_a_hangup_ends_the_run_in_good_order(tmp_path):
-    """SIGTERM ends that of `stepped`, SIGINT that of the real clock."""
-    link = tmp_path / "tty"
-    emulator = Emulator("--symlink", str(link), *NO_IMAGES_OPTIONS)
-    assert emulator.end(signal.SIGHUP) == (0, [])
-    assert not link.is_symlink()
-
-
 def test_a_signal_to_the_worker_too_disturbs_no_image(stepped):
     """Nor is it reported: what `stepped` has said is seen at its end."""
     children = Path(f"/proc/{stepped.process.pid}/task/{stepped.process.pid}/children").read_text().split()
@@ -267,10 +252,15 @@ def is_running(pid: str) -> bool:
         return False
 
 
-def test_the_worker_ends_with_a_killed_emulator_and_the_next_one_takes_its_place(tmp_path):
+def test_two_runs_of_one_seed_give_the_same_bytes_and_a_killed_one_leaves_no_worker_and_its_place(
+    stepped, tmp_path
+):
+    """A hangup ends the last one in good order, as SIGTERM does that of `stepped`, and SIGINT that of the real clock."""
     link = tmp_path / "tty"
-    arguments = ("--symlink", str(link), "--state-dir", str(tmp_path), "--set", "links.serial.dialect=a")
+    arguments = (*SEEDED, "--symlink", str(link), "--state-dir", str(tmp_path))
     emulator = Emulator(*arguments)
+    assert len(stepped.first_bytes) > 2000
+    assert first_bytes(emulator) == stepped.first_bytes
     pid = emulator.process.pid
     (worker,) = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
     code, _ = emulator.end(signal.SIGKILL)
@@ -279,7 +269,8 @@ def test_the_worker_ends_with_a_killed_emulator_and_the_next_one_takes_its_place
     assert link.is_symlink()
     emulator = Emulator(*arguments, *NO_IMAGES_OPTIONS)
     assert emulator.read("boot_status")["boot_count"] == 2
-    assert emulator.end() == (0, [])
+    assert emulator.end(signal.SIGHUP) == (0, [])
+    assert not link.is_symlink()
 
 
 @pytest.mark.parametrize(
@@ -314,7 +305,17 @@ def test_a_unit_that_gets_the_sensor_of_the_default_profile_is_noted():
 
 
 def test_attitudes_that_are_valid_whatever_their_uncertainty_are_noted():
-    words = ("--can", "off", "--serial", "/dev/no_such_tty", "--set", "run.algorithm=rsi", "--set")
+    words = (
+        "--can",
+        "off",
+        "--serial",
+        "/dev/no_such_tty",
+        "--set",
+        "run.algorithm=rsi",
+        "--set",
+        "run.worker=thread",
+        "--set",
+    )
     assert "note:" not in run_command_line("run", *words, "identifier.refinement=true")[2]
     note, _ = log_lines(run_command_line("run", *words, "identifier.refinement=false")[2])
     assert note == (

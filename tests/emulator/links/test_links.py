@@ -544,7 +544,7 @@ def test_the_same_commands_give_the_same_bytes(make_bench):
                 (104, b"\xa0\x00\x00\x80\x40"),
             ):
                 linked.uart.arrive(CUBESPACE.encode_request(Request.of(identifier, data)))
-            for _ in range(30):
+            for _ in range(12):
                 bench.step(0.137)
                 for row in bench.icd.telemetry.values():
                     linked.uart.arrive(CUBESPACE.encode_request(Request.of(row.id)))
@@ -558,7 +558,7 @@ def test_the_same_commands_give_the_same_bytes(make_bench):
         return bytes(out)
 
     first = run()
-    assert len(first) > 10_000
+    assert len(first) > 4000
     assert first == run()
 
 

@@ -29,7 +29,7 @@ SIRIUS = 32349
 
 PUBLISHED_3_SIGMA_ARCSEC = np.array([55.4, 55.4, 77.4])
 """About x, y and z."""
-SCATTERED = 100
+SCATTERED = 60
 
 
 def solved(pipeline, parameters) -> list[tuple[Attitude, Attitude]]:
@@ -142,6 +142,6 @@ def test_errors_of_cubestar_are_the_published_ones_with_little_bias_and_as_state
     relative = np.abs(errors) / stated
     assert np.mean(relative[:, :2] < 3.0) > 0.98  # 0.997 expected
     assert np.mean(relative[:, 2] < 3.0) > 0.98
-    assert 0.8 < np.sqrt(np.mean(relative[:, :2] ** 2)) < 1.2  # 1 with a sampling error of 0.05
+    assert 0.8 < np.sqrt(np.mean(relative[:, :2] ** 2)) < 1.2  # 1 with a sampling error of 0.06
     assert np.all(np.abs(np.mean(errors, axis=0)) < 0.25 * PUBLISHED_3_SIGMA_ARCSEC)
     assert 3.0 * np.std(errors, axis=0) == pytest.approx(PUBLISHED_3_SIGMA_ARCSEC, rel=0.25)

@@ -6,7 +6,7 @@ import pytest
 
 from starhil.emulator.profile import load_profile
 from starhil.emulator.run import Run
-from tests.emulator.runs import FirstHead, command
+from tests.emulator.runs import FirstHead, command, read
 from tests.waiting import PATIENCE_S, until
 
 FRAMES = 3
@@ -83,13 +83,18 @@ def test_after_a_reset_it_is_solved_with_the_restored_parameters(tmp_path):
 
 
 @pytest.mark.process
-def test_after_the_end_of_the_pipeline_it_is_solved_with_the_current_parameters(tmp_path):
+def test_after_the_end_of_the_pipeline_which_is_reported_it_is_solved_with_the_current_parameters(tmp_path):
     async def kill(emulation):
+        assert all(result.valid for result in await first_frames(emulation))
         emulation.imager.worker.process.kill()
         await until(lambda: emulation.device.modes.mode.value == "error")
-        await until(lambda: emulation.device.warm)
+        assert emulation.device.modes.error == "processing"
+        assert read(emulation, "precise_attitude")["reason"] == "processing_error"
+        await until(lambda: emulation.device.warm)  # another one comes up by itself
         command(emulation, "set_mode", mode="standby")
         command(emulation, "set_mode", mode="lost_in_space")
         return await first_frames(emulation)
 
-    assert not any(result.index_pending for result in run(kill, tmp_path, worker="process"))
+    results = run(kill, tmp_path, worker="process")
+    assert not any(result.index_pending for result in results)
+    assert all(result.valid for result in results)

@@ -15,19 +15,16 @@ from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.profile import Profile, load_profile
-from starhil.emulator.profile.sections import RunConfig
 from starhil.emulator.run import Run
 from starhil.emulator.run.truth_log import COLUMNS
-from starhil.emulator.sensor.pipeline.client import WorkerClient
 from starhil.emulator.sensor.pipeline.messages import PipelineReady
-from starhil.emulator.simulation.clock import SteppedClock
 from starhil.emulator.truth.file import read_truth_file
 from starhil.hil_tests.rig.private_can_bus import hub_thread
 from starhil.protocol.errors import IcdError, ProtocolError
 from starhil.protocol.files.bundled import bundled
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.unit import load_unit
-from tests.emulator.runs import CAMERA, Control, FakeImager, FirstHead, command, read
+from tests.emulator.runs import CAMERA, Control, FakeImager, command
 from tests.waiting import until
 
 
@@ -402,41 +399,6 @@ def test_a_truth_log_that_cannot_be_written_is_rejected(run, tmp_path):
 
     with pytest.raises(EmulatorError, match="truth log"):
         run(scenario, options=RunOptions(truth_log=tmp_path / "no" / "log.csv"))
-
-
-@pytest.mark.process
-def test_a_pipeline_that_dies_is_reported_and_restarted():
-    profile = Profile.model_validate(
-        {"links": {"serial": {"port": "off"}, "can": {"channel": "off"}}, "run": {"clock": "stepped"}}
-    )
-    assert profile.run == RunConfig(clock="stepped")
-
-    async def scenario():
-        run = Run([profile])
-        assert isinstance(run.clock, SteppedClock)
-        try:
-            await run.open()
-            run.begin()
-            await run.ready()
-            emulation = FirstHead(run)
-            assert isinstance(emulation.imager, WorkerClient)
-            await emulation.stepper.step(1.0)
-            command(emulation, "set_mode", mode="lost_in_space")
-            await emulation.stepper.step(2.0)
-            assert emulation.device.latest.valid
-            emulation.imager.worker.process.kill()
-            await until(lambda: emulation.device.modes.mode.value == "error")
-            assert emulation.device.modes.error == "processing"
-            assert read(emulation, "precise_attitude")["reason"] == "processing_error"
-            await until(lambda: emulation.device.warm)  # another one comes up by itself
-            command(emulation, "set_mode", mode="standby")
-            command(emulation, "set_mode", mode="lost_in_space")
-            await emulation.stepper.step(2.0)
-            assert emulation.device.latest.valid
-        finally:
-            await run.close()
-
-    asyncio.run(scenario())
 
 
 class Unclosable:

@@ -23,7 +23,7 @@ from tests.emulator.sensor.pipeline.known_photometry import known_photometry
 pytestmark = pytest.mark.long
 
 SEQUENCES = 15
-IMAGES = 5
+IMAGES = 4
 SIGMAS = 4.0
 """Tolerance in standard deviations of the mean of independent sequences."""
 RIGHT_DEG = 1.5
@@ -69,10 +69,10 @@ def answers(profile: str, rate_deg_s: float) -> list[tuple[np.ndarray, np.ndarra
     return sequences
 
 
-RATES = [(profile, rate) for profile in ("ideal", "cubestar", "thesis") for rate in (0.0, 0.3, 2.0)]
-"""Profiles with rates in degrees per second."""
+RATES = [("ideal", 0.0), ("ideal", 2.0), ("cubestar", 0.3), ("thesis", 0.0), ("thesis", 2.0)]
+"""Profiles with rates in degrees per second: each camera, and each motion whose errors are known."""
 CASES = [*([each] for each in RATES), RATES]
-"""Each by itself, and all together, in which an error of a third of the size is found."""
+"""Each by itself, and all together, in which an error of half the size is found."""
 
 
 def answers_of(case: list[tuple[str, float]]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:

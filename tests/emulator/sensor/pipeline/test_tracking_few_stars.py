@@ -26,7 +26,7 @@ COVARIANCE = np.diag((np.array([45.0, 45.0, 75.0]) / ARCSEC_PER_RAD) ** 2)
 """As the device states it after two images."""
 FREEDOM = 57.0
 """Its degrees of freedom, from two images of 16 stars each."""
-FRAMES = 40
+FRAMES = 20
 
 
 def error_arcsec(result: FrameResult, truth: Attitude) -> float:

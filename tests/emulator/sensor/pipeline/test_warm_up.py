@@ -39,7 +39,7 @@ before = kernels()
 exposure_s = profile.parameters["exposure"] / 1000.0
 bright = sys.argv[1] == "ideal"
 for rate in ((0.0, 0.0, 0.0), (0.0, 0.0052, 0.0), (0.01, 0.01, 0.0), (0.0, 0.03, 0.0), (0.0, 0.0, 0.05)):
-    for index in range(4):
+    for index in range(2):
         predicted = requests[0].truth.attitude if index % 2 else None
         truth = replace(requests[0].truth, rate_rad_s=np.array(rate))
         request = replace(requests[0], index=index, truth=truth, predicted=predicted, exposure_s=exposure_s)

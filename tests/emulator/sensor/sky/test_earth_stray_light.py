@@ -43,7 +43,7 @@ def test_a_small_earth_is_a_sun_as_bright_as_its_disc(away_deg):
 @pytest.mark.long
 @pytest.mark.parametrize("sun_deg", [(180.0, 0.0), (60.0, 30.0), (10.0, -70.0)])
 def test_a_wide_earth_gives_the_sum_over_its_parts(sun_deg):
-    """200 000 random lines of sight to a sphere of radius 1, each as bright as the cosine of the Sun's zenith distance."""
+    """140 000 random lines of sight to a sphere of radius 1, each as bright as the cosine of the Sun's zenith distance."""
     nadir_deg, radius_deg = 100.0, 64.0
     sun = Attitude.from_radec_roll(*sun_deg, 0.0).boresight
     earth = EarthLimb(
@@ -56,7 +56,7 @@ def test_a_wide_earth_gives_the_sum_over_its_parts(sun_deg):
     )
     nadir = Attitude.from_radec_roll(nadir_deg, 0.0, 0.0).boresight
     rng = np.random.default_rng(1)
-    lines = rng.normal(size=(1_500_000, 3))
+    lines = rng.normal(size=(500_000, 3))
     lines /= np.linalg.norm(lines, axis=1)[:, None]
     lines = lines[lines @ nadir > math.cos(math.radians(radius_deg))]
     distance = 1.0 / math.sin(math.radians(radius_deg))
@@ -67,7 +67,7 @@ def test_a_wide_earth_gives_the_sum_over_its_parts(sun_deg):
     lit = np.maximum(normals @ sun, 0.0)
     chord = np.linalg.norm(lines - AT.boresight, axis=1)
     soft = 2.0 * math.sin(math.radians(1.5))
-    weight = lit * 0.3 / math.pi * 4.0 * math.pi / 1_500_000 * (chord < math.sqrt(2.0))
+    weight = lit * 0.3 / math.pi * 4.0 * math.pi / 500_000 * (chord < math.sqrt(2.0))
     by_distance = float(np.sum(weight / (chord**2 + soft**2) ** 1.5))
     away = 2.0 * math.sin(math.radians(20.0))
     sun_40 = glow_e_s(SkyObjects(sun=SunGlare(40.0, 0.0, stray_share=SHARE)))

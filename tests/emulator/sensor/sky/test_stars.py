@@ -88,7 +88,7 @@ def test_the_attitude_is_off_by_the_mean_of_its_stars_errors() -> None:
     sigma = 60.0
     sky = SkyObjects(catalog_position_error_arcsec=sigma)
     over = []
-    for seed in range(40):
+    for seed in range(20):
         renderer = Renderer(CAMERA, catalog, seed=seed)
         attitude = random_attitude(np.random.default_rng(seed))
         stars = renderer.render(attitude, objects=sky).stars
