@@ -320,7 +320,7 @@ SETTINGS: Final = {
     "cubestar": [
         "orbit=leo",
         "links.serial.dialect=c",
-        "parameters.unsolicited_rate=10",
+        "parameters.unsolicited_rate=5",
         "parameters.unsolicited_selection=160",
     ],
     "sagitta": ["orbit=leo"],
@@ -416,6 +416,8 @@ def test_each_key_does_the_same_in_every_way_and_is_repeated_to_the_byte(recorde
             lasting.append((level, key))
     assert (unlike, set(idle) - WITHOUT_EFFECT, lasting) == ([], set(), [])
     assert all(outputs.values())
-    tapes = {(folder / EVENTS_FILE).read_bytes(): folder for folder in folders.values()}
-    for folder in tapes.values():  # equal tapes are played alike
-        assert asyncio.run(replay(folder)).differences == []
+    for way in (
+        "pytest",
+        "scenario",
+    ):  # the tapes of the others have the same requests and output as the first
+        assert asyncio.run(replay(folders[way])).differences == []

@@ -175,7 +175,7 @@ def unit_of_others(tmp_path):
 def test_nothing_runs_that_only_a_recording_names(tmp_path, unit_of_others, monkeypatch):
     unit, mark = unit_of_others
     folder = tmp_path / "recorded"
-    prepare_recording(folder, Profile(unit=str(unit)), "")
+    prepare_recording(folder, Profile(unit=str(unit), run={"worker": "error_model"}), "")
     status, _, err = run_command_line("replay", str(folder))
     assert (status, mark.exists()) == (2, False)
     assert err.count("\n") == 1
@@ -216,7 +216,7 @@ def test_a_unit_of_toml_alone_is_replayed_from_where_it_was(tmp_path):
     unit = tmp_path / "unit"
     shutil.copytree(UNITS_FOLDER / "st200", unit)
     folder = tmp_path / "recorded"
-    prepare_recording(folder, Profile(unit=str(unit)), "")
+    prepare_recording(folder, Profile(unit=str(unit), run={"worker": "error_model"}), "")
     _, _, err = run_command_line("replay", str(folder))
     assert f"{folder / EVENTS_FILE}: cannot be read" in err
 

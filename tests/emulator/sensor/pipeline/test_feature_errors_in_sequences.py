@@ -24,7 +24,7 @@ pytestmark = pytest.mark.long
 
 SEQUENCES = 15
 IMAGES = 4
-SIGMAS = 4.0
+SIGMAS = 3.0
 """Tolerance in standard deviations of the mean of independent sequences."""
 RIGHT_DEG = 1.5
 LIKELY_RIGHT = 0.1

@@ -66,7 +66,7 @@ def limit_error(count):
 def test_the_limit_varies_no_more_from_one_start_to_the_next_than_the_stars_seen_make_it():
     rng = np.random.default_rng(7)
     limits = [_limit_of(*stars_of_a_detector(rng, 2000)).limit for _ in range(40)]
-    assert np.std(limits) <= limit_error(2000) * (1.0 + 4.0 / math.sqrt(80.0))
+    assert np.std(limits) <= limit_error(2000) * (1.0 + 3.0 / math.sqrt(80.0))
     assert np.mean(limits) == pytest.approx(NINETY, abs=0.5 * limit_error(2000))
 
 

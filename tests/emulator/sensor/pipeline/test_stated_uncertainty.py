@@ -18,7 +18,7 @@ from starid.attitude import ARCSEC_PER_RAD, Attitude
 
 pytestmark = pytest.mark.long
 
-SIGMAS = 4.0
+SIGMAS = 3.0
 """Tolerance in standard deviations of the mean."""
 
 
@@ -48,7 +48,7 @@ def errors_over_stated(
 
 
 def test_an_error_of_the_calibration_is_not_taken_for_noise_about_the_boresight() -> None:
-    about = errors_over_stated("cubestar", 0.0, 80)[0][:, 2]
+    about = errors_over_stated("cubestar", 0.0, 85)[0][:, 2]
     assert np.mean(about**2) == pytest.approx(1.0, abs=SIGMAS * math.sqrt(2.0 / len(about)))
     for limit, share in ((1.0, 0.683), (2.0, 0.954), (3.0, 0.9973)):
         sampling = math.sqrt(share * (1.0 - share) / len(about))
@@ -67,7 +67,7 @@ def test_the_errors_of_a_calibration_are_stated_by_each_profile_that_has_them() 
 RATES = [(2.0, 200), (5.0, 100), (5.0, 200)]
 """In degrees per second, with exposures in milliseconds."""
 TRAILS = [*([each] for each in RATES), RATES]
-"""Each by itself, and all together, in which an error of six tenths of the size is found."""
+"""Each by itself, and all together, in which an error of half the size is found."""
 
 INNER = ("camera.width=600", "camera.height=600", "camera.fov_deg=27.62")
 """The middle of the detector, with pixels of the same size: two fifths of the stars."""
@@ -75,7 +75,7 @@ INNER = ("camera.width=600", "camera.height=600", "camera.fov_deg=27.62")
 
 @cache
 def errors_of_trail(rate_deg_s: float, exposure_ms: int) -> tuple[np.ndarray, np.ndarray]:
-    return errors_over_stated("ideal", rate_deg_s, 50, f"parameters.exposure={exposure_ms}", *INNER)
+    return errors_over_stated("ideal", rate_deg_s, 60, f"parameters.exposure={exposure_ms}", *INNER)
 
 
 def errors_of(trails: list[tuple[float, int]]) -> tuple[np.ndarray, np.ndarray]:
