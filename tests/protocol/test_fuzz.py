@@ -273,6 +273,6 @@ class SerialReceiverMachine(RuleBasedStateMachine):
 
 
 SerialReceiverMachine.TestCase.settings = settings(
-    max_examples=60, stateful_step_count=30, deadline=None, derandomize=True
+    max_examples=25, stateful_step_count=30, deadline=None, derandomize=True
 )
 TestSerialReceiver = SerialReceiverMachine.TestCase

@@ -113,7 +113,7 @@ def test_a_message_too_long_for_the_counter_is_rejected() -> None:
         segment(bytes(MAX_MESSAGE + 1))
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.integers(0, 255), st.binary(max_size=512), st.integers(0, 255))
 def test_requests_survive_encoding_and_decoding(identifier: int, data: bytes, source: int) -> None:
     if identifier >= 128:
@@ -132,7 +132,7 @@ replies = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.lists(replies, max_size=5))
 def test_replies_survive_encoding_and_decoding(sent: list[Reply]) -> None:
     receiver = CanHostReceiver(OBC, DEVICE)
@@ -294,7 +294,7 @@ def test_the_receiver_survives_ten_thousand_random_frames() -> None:
 # -- identifiers, frames, logs -----------------------------------------------------------------------------------------
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.integers(0, 0x1FFFFFFF))
 def test_can_ids_are_split_and_joined(raw: int) -> None:
     assert CanId.unpack(raw).pack() == raw
@@ -330,7 +330,7 @@ def test_candump_lines_have_the_format_of_candump() -> None:
     )
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(
     st.builds(
         CanFrame,

@@ -26,13 +26,21 @@ from tests.protocol.canopen.stand_in import StandInApplication
 NODE = 0x2C
 
 
+@lru_cache
+def shared_dictionary(unit: str) -> DeviceDictionary:
+    """Build the dictionary of a unit once: most of the time of a test would go there, and a slave connects all of it again."""
+    return DeviceDictionary(load_unit(unit))
+
+
 class Bench:
-    """One slave, a manual clock, and the frames and events of the slave."""
+    """One slave, a manual clock, and the frames and events of the slave; the benches of a unit are used one after the other."""
 
     def __init__(
         self, node_id: int = NODE, storage: ParameterStorage | None = None, unit: str = "cubestar", **options
     ) -> None:
-        self.dictionary: DeviceDictionary = DeviceDictionary(load_unit(unit))
+        self.dictionary = shared_dictionary(unit)
+        self.dictionary.changed.clear()
+        self.dictionary.new_instant()
         self.application = StandInApplication(self.dictionary.icd)
         self.dictionary.application = self.application
         self.storage = storage
@@ -189,9 +197,9 @@ def import_eds(text: str, node_id: int) -> canopen.ObjectDictionary:
         return canopen.import_od(file, node_id)
 
 
-def simulated_probe() -> CanopenProbe:
-    """Put the slave on a simulated bus, with the tester at its other end."""
-    dictionary = DeviceDictionary(load_unit())
+def simulated_probe(dictionary: DeviceDictionary | None = None) -> CanopenProbe:
+    """Put the slave on a simulated bus, with the tester at its other end; its dictionary is built now or given."""
+    dictionary = DeviceDictionary(load_unit()) if dictionary is None else dictionary
 
     class RestlessApplication(StandInApplication):
         """Each look at the attitude finds a new one, so that values of two samples cannot be taken for one."""

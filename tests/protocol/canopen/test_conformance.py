@@ -7,6 +7,7 @@ import pytest
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.runner import run_case
 from tests.planted import Edit, LostAimError, planted
+from tests.protocol.canopen.conftest import shared_dictionary
 from tests.protocol.canopen.mutants import MUTANTS
 
 pytestmark = pytest.mark.long
@@ -19,7 +20,7 @@ def case_of(mutant):
 @pytest.mark.parametrize("case", CANOPEN_CASES, ids=lambda case: case.id)
 def test_our_slave_passes_and_safe_cases_change_nothing(simulated_probe, case):
     """A case that is not intrusive sends nothing but SDO requests that read, and frames that are no request."""
-    probe = simulated_probe()
+    probe = simulated_probe(shared_dictionary("cubestar"))
     outcome = run_case(probe, case)
     assert (outcome.status, outcome.expected, outcome.seen) == ("passed", "", ""), "\n".join(outcome.log)
     for frame in () if case.intrusive else [line.split(" -> ")[1] for line in probe.log if " -> " in line]:

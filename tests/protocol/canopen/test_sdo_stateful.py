@@ -333,7 +333,7 @@ class SdoMachine(RuleBasedStateMachine):
 def test_any_order_of_requests(new_bench):
     machine = type("BoundSdoMachine", (SdoMachine,), {"new_bench": new_bench})
     limits = settings(
-        max_examples=60,
+        max_examples=25,
         stateful_step_count=50,
         deadline=None,
         derandomize=True,
@@ -361,7 +361,7 @@ FRAMES = st.lists(
 
 @given(frames=FRAMES)
 @settings(
-    max_examples=150,
+    max_examples=50,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

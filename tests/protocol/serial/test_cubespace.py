@@ -126,7 +126,7 @@ def test_an_endless_message_keeps_within_bounds_and_counts_once() -> None:
     assert receiver.feed(CUBESPACE.encode_request(GOOD), 0.0) == [GOOD]
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.lists(requests, max_size=6), st.lists(st.integers(1, 40), min_size=1), st.booleans())
 def test_requests_are_decoded_from_a_stream_cut_anywhere(
     originals: list[Request], cuts: list[int], doubled: bool
@@ -150,7 +150,7 @@ def test_requests_are_decoded_from_a_stream_cut_anywhere(
     assert events == originals
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.binary(max_size=400), st.integers(1, 50))
 def test_events_do_not_depend_on_how_noise_is_cut(noise: bytes, size: int) -> None:
     whole = limited(max_size=32).device().feed(noise, 0.0)
@@ -294,7 +294,7 @@ def test_a_telecommand_answered_by_more_than_a_code_is_a_fault() -> None:
 reply_data = st.binary(min_size=2, max_size=80).filter(lambda data: len(data) != BURST_SIZE + 1)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.sampled_from(Dialect), st.integers(128, 255), reply_data)
 def test_telemetry_comes_back_in_each_dialect(dialect: Dialect, identifier: int, data: bytes) -> None:
     receiver = CUBESPACE.host(dialect)
@@ -303,7 +303,7 @@ def test_telemetry_comes_back_in_each_dialect(dialect: Dialect, identifier: int,
     assert receiver.feed(CUBESPACE.encode_reply(reply, dialect), 0.0) == [reply]
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.sampled_from(Dialect), st.lists(st.binary(max_size=40), max_size=8))
 def test_the_host_survives_any_bytes(dialect: Dialect, noise: list[bytes]) -> None:
     receiver = limited(max_size=64).host(dialect)

@@ -44,7 +44,7 @@ def test_the_sender_that_has_most_waiting_loses_its_oldest() -> None:
     assert queue.take(100) == [b"f3", b"o1", b"f4", b"o2"]
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(
     st.lists(
         st.tuples(

@@ -312,7 +312,7 @@ frames = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(frames)
 def test_frames_survive_both_directions(frame: CanFrame) -> None:
     assert parse_send(format_send(frame).strip(b"<> ")) == frame
@@ -322,7 +322,7 @@ def test_frames_survive_both_directions(frame: CanFrame) -> None:
     )  # fmt: skip
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.binary(max_size=200), st.integers(1, 40))
 def test_commands_do_not_depend_on_how_the_stream_is_cut(noise: bytes, size: int) -> None:
     splitter = CommandSplitter()
@@ -334,7 +334,7 @@ def test_commands_do_not_depend_on_how_the_stream_is_cut(noise: bytes, size: int
     assert pieces == CommandSplitter().feed(noise)
 
 
-@settings(max_examples=500, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(
     st.one_of(st.binary(max_size=80), st.text("send frame0123456789ABCDEF<>x.", max_size=60).map(str.encode))
 )

@@ -176,7 +176,7 @@ def _row_values() -> st.SearchStrategy[tuple[Row, dict[str, Value]]]:
 
 
 @pytest.mark.long
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(_row_values())
 def test_every_row_decodes_the_values_it_encoded(case: tuple[Row, dict[str, Value]]) -> None:
     row, values = case
@@ -185,7 +185,7 @@ def test_every_row_decodes_the_values_it_encoded(case: tuple[Row, dict[str, Valu
     assert row.decode(data, check=True) == values
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(st.sampled_from(ROWS), st.data())
 def test_any_bytes_of_the_right_length_decode_and_never_raise_but_for_limits(
     row: Row, data: st.DataObject
