@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 _IMPORT = re.compile(
     r"^ *(?:from|import) (?P<module>starhil[\w.]*)(?: import (?P<names>\([^)]*\)|.*))?", re.MULTILINE
@@ -250,10 +250,15 @@ def _forget(changed: set[str]) -> None:
     while changed - reached:
         reached |= changed
         changed = {name for name, module in modules.items() if not reached.isdisjoint(_imports(module))}
-    values = [value for name in reached for value in vars(modules[name]).values()]
-    for item in {id(value): value for value in values}.values():
-        if isinstance(item, _CACHED):
+    for name in reached:
+        for item in _caches(modules[name]):
             item.cache_clear()
+
+
+@functools.cache
+def _caches(module: types.ModuleType) -> list[Any]:
+    """Return the cached functions of a module."""
+    return [value for value in vars(module).values() if isinstance(value, _CACHED)]
 
 
 @functools.cache

@@ -11,13 +11,15 @@ WORKER_WAIT_S: Final = 0.001
 
 
 class _SimulatedSelector(selectors.SelectSelector):
-    """Never waits for a timer: the time that would be waited is added to `time`."""
+    """Never waits for a timer: the time that would be waited is added to `time`. Files are looked at once nothing else is due."""
 
     def __init__(self) -> None:
         super().__init__()
         self.time = 0.0
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        if timeout == 0:
+            return []
         events = super().select(0 if timeout is not None else WORKER_WAIT_S)
         if not events and timeout is not None:
             self.time += timeout

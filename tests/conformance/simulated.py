@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -31,13 +32,16 @@ from starhil.emulator.sensor.pipeline.messages import (
 from starhil.emulator.truth.source import FixedTruth
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
+from starhil.hil_tests.conformance.canopen_suite import canopen_suite
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
+from starhil.hil_tests.conformance.runner import Outcome, run_case
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
-from starhil.hil_tests.conformance.suites import settings_of
+from starhil.hil_tests.conformance.suites import can_suite, serial_suite, settings_of
 from starhil.hil_tests.judge.canopen import entries
 from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.export import eds
 from starhil.protocol.files.bundled import DEFAULT_UNIT
+from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.paced import PacedTransport
 from starhil.protocol.unit import load_unit
@@ -46,8 +50,6 @@ from tests.emulator.runs import DirectImager
 from tests.protocol.canopen.conftest import import_eds
 
 BAUD = 115200
-BOUND_S = 0.0005
-"""A turn of the loop that waits for nothing takes this long, so that simulated time goes on."""
 
 
 class LoopClock:
@@ -71,7 +73,7 @@ class MemoryTransport(PacedTransport):
     def __init__(self, *, paced: bool) -> None:
         super().__init__("virtual:memory", BAUD if paced else None)
         self.out: deque[Any] = deque()
-        self.arrived = asyncio.Event()
+        self.on_arrival: Callable[[], None] = lambda: None
 
     async def _open(self) -> None:
         """There is no port."""
@@ -85,7 +87,7 @@ class MemoryTransport(PacedTransport):
 
     def _put(self, item: Any) -> None:
         self.out.append(item)
-        self.arrived.set()
+        self.on_arrival()
 
     def send(self, item: Any) -> bool:
         if self._pace is not None:
@@ -114,23 +116,17 @@ class SimulatedPort:
         self._unit.loop.call_soon(self._unit.transport.deliver, item)
 
     def receive(self, timeout_s: float) -> Any:
-        transport = self._unit.transport
+        loop, transport = self._unit.loop, self._unit.transport
         if not transport.out and timeout_s > 0:
-            self._unit.loop.run_until_complete(self._wait(timeout_s))
+            transport.on_arrival = loop.stop
+            expiry = loop.call_later(timeout_s, loop.stop)
+            loop.run_forever()
+            expiry.cancel()
+            transport.on_arrival = lambda: None
         else:
-            self._unit.loop.run_until_complete(asyncio.sleep(0))
+            loop.call_soon(loop.stop)
+            loop.run_forever()
         return transport.out.popleft() if transport.out else None
-
-    async def _wait(self, timeout_s: float) -> None:
-        transport = self._unit.transport
-        transport.arrived.clear()
-        if transport.out:
-            return
-        try:
-            async with asyncio.timeout(timeout_s):
-                await transport.arrived.wait()
-        except TimeoutError:
-            return
 
     def now(self) -> float:
         return self._unit.loop.time()
@@ -169,6 +165,7 @@ class TruthImager:
 
 
 LINKS: dict[str, Callable[..., Any]] = {"serial": SerialLink, "can": CanLink, "canopen": CanopenLink}
+SUITES: dict[str, Callable[..., Any]] = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
 
 
 class SimulatedUnit:
@@ -176,7 +173,7 @@ class SimulatedUnit:
 
     `damage` is called with the unit before the device is switched on: it is how mutants are made. Another way is to
     have the device serve another definition than that of the tester: a folder, in `served`. `parameters` are those of the profile; the
-    others have the unit's defaults, as of `starhil conformance --start`.
+    others have the unit's defaults, as of `starhil conformance --start`. `icd` is the definition of the unit, if it has been read.
     """
 
     def __init__(
@@ -187,12 +184,13 @@ class SimulatedUnit:
         unit: str | Path = DEFAULT_UNIT,
         served: Path | None = None,
         parameters: Mapping[str, Any] | None = None,
+        icd: InterfaceDefinition | None = None,
     ) -> None:
         self.loop = SimulatedLoop()
         self.kind = link
         self.dialect = dialect
-        self.unit = unit
-        self.icd = load_unit(unit)
+        self.icd = icd or load_unit(unit)
+        self.judged = read_unit(unit)
         self._served = self.icd if served is None else load_unit(served)
         self._damage = damage
         self._parameters = parameters or {}
@@ -203,7 +201,7 @@ class SimulatedUnit:
         port = SimulatedPort(self)
         times = ProbeTimes(answer_s=0.5, quiet_s=0.1, boot_s=5.0, image_s=10.0)
         self.probe: SerialProbe | CanProbe | CanopenProbe
-        unit = read_unit(self.unit)
+        unit = self.judged
         if self.kind == "canopen":
             node = int(self.icd.parameters["canopen_node"].default)
             text = eds.render(self.icd)
@@ -244,3 +242,16 @@ class SimulatedUnit:
         self.loop.run_until_complete(self.link.close())
         self.loop.close()
         asyncio.set_event_loop(None)
+
+
+def outcomes(link: str, unit: str | Path, dialect: str = "b") -> Iterator[Outcome]:
+    """Yield the outcomes of the cases of a link."""
+    with SimulatedUnit(link, dialect=dialect, unit=unit) as simulated:
+        for case in SUITES[link](simulated.judged):
+            yield run_case(simulated.probe, case)
+
+
+@cache
+def healthy_outcomes(link: str, unit: str, dialect: str = "b") -> tuple[Outcome, ...]:
+    """Return the outcomes of the cases of an intact bundled unit, for all modules that look at them."""
+    return tuple(outcomes(link, unit, dialect))

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.hil_tests.conformance.runner import run_case
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
-from tests.conformance.simulated import SimulatedUnit
+from tests.conformance.simulated import healthy_outcomes
 
 pytestmark = pytest.mark.long
 
@@ -19,8 +18,7 @@ SUITES = {"serial": serial_suite(UNIT), "can": can_suite(UNIT)}
     ("link", "dialect"), [("serial", "b"), ("serial", "a"), ("serial", "c"), ("can", "b")]
 )
 def test_the_healthy_device_passes_every_case(link, dialect):
-    with SimulatedUnit(link, dialect=dialect) as unit:
-        outcomes = [run_case(unit.probe, case) for case in SUITES[link]]
+    outcomes = healthy_outcomes(link, "cubestar", dialect)
     failed = [(o.id, o.expected, o.seen, o.log[-6:]) for o in outcomes if o.status == "failed"]
     assert failed == []
     assert {o.id.split(".")[1] for o in outcomes if o.status == "skipped"} == {"unjudged"}

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from starhil.hil_tests.conformance.canopen_suite import canopen_suite
-from starhil.hil_tests.conformance.runner import Outcome, run_case
-from starhil.hil_tests.conformance.suites import can_suite, serial_suite
-from starhil.hil_tests.judge.definition import read_unit
+from starhil.hil_tests.conformance.runner import run_case
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.unit import load_unit
 from starhil.protocol.unit.examples import examine, exchanges
 from tests.conformance.links import LINKS, write_unit
 from tests.conformance.protocol_mutants import MUTANTS, ProtocolMutant
-from tests.conformance.simulated import SimulatedUnit
+from tests.conformance.simulated import SUITES, SimulatedUnit, outcomes
 from tests.planted import Edit, LostAimError, planted
 from tests.test_your_unit import written
 
 pytestmark = pytest.mark.long
 
-SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
 MECHANISMS = (
     "checks", "framings", "headers", "scalar types", "scaling", "bits", "enumerations", "lengths", "segmentation",
     "PDO mapping", "unsolicited telemetry", "byte stuffing", "formats", "texts",
@@ -51,23 +46,16 @@ def test_each_mechanism_has_at_least_five_mutants() -> None:
 def test_an_error_of_both_ends_fails_a_case(mutant: ProtocolMutant, tmp_path: Path) -> None:
     folder = unit_of(mutant.unit, tmp_path / "unit")
     with mutant.planted():
-        assert bool(examine(folder)[1]) is not mutant.hidden, examine(folder)[1]
-        unit = read_unit(folder)
-        cases = {case.id: case for case in SUITES[mutant.link](unit)}
+        icd, errors, _ = examine(folder)
+        assert bool(errors) is not mutant.hidden, errors
         failed = []
-        with SimulatedUnit(mutant.link, unit=folder) as simulated:
+        with SimulatedUnit(mutant.link, unit=folder, icd=icd) as simulated:
+            cases = {case.id: case for case in SUITES[mutant.link](simulated.judged)}
             for case in mutant.cases:
                 outcome = run_case(simulated.probe, cases[f"{mutant.link}.{case}"])
                 failed += [outcome] if outcome.status == "failed" else []
     assert [outcome.id for outcome in failed] == [f"{mutant.link}.{case}" for case in mutant.cases]
     assert all(outcome.expected and outcome.seen for outcome in failed)
-
-
-def outcomes(unit: str | Path) -> Iterator[Outcome]:
-    """Yield the outcomes of the cases on the serial line."""
-    with SimulatedUnit("serial", unit=unit) as simulated:
-        for case in serial_suite(read_unit(unit)):
-            yield run_case(simulated.probe, case)
 
 
 def messages(unit: Path) -> list[object]:
@@ -80,7 +68,7 @@ def messages(unit: Path) -> list[object]:
 
 @pytest.mark.parametrize("streams_by_itself", [False, True])
 def test_the_unit_of_the_tutorial_passes_every_case(streams_by_itself: bool, tmp_path: Path) -> None:
-    results = list(outcomes(written(tmp_path / "lynx", streams_by_itself)))
+    results = list(outcomes("serial", written(tmp_path / "lynx", streams_by_itself)))
     assert [
         (o.id, o.expected, o.seen) for o in results if o.status != "passed" and ".unjudged." not in o.id
     ] == []
@@ -91,11 +79,12 @@ def test_every_error_that_changes_a_message_of_the_tutorial_fails_a_case(tmp_pat
     unit = written(tmp_path / "lynx")
     healthy = messages(unit)
     missed, caught = [], 0
-    for mutant in (mutant for mutant in MUTANTS if mutant.unit != "tutorial"):  # those have their cases above
+    # those of the tutorial have their cases above
+    for mutant in (each for each in MUTANTS if each.unit != "tutorial" and each.link == "serial"):
         with mutant.planted():
             if messages(unit) != healthy:
                 caught += 1
-                if all(outcome.status != "failed" for outcome in outcomes(unit)):
+                if all(outcome.status != "failed" for outcome in outcomes("serial", unit)):
                     missed.append(mutant.name)
     assert missed == []
     assert caught >= 20
@@ -108,14 +97,13 @@ def test_every_error_that_changes_a_message_of_the_tutorial_fails_a_case(tmp_pat
 )
 def test_a_unit_on_any_link_passes_every_case(link: str, order: str, tmp_path: Path) -> None:
     folder = write_unit(tmp_path / "unit", link, order)
-    with SimulatedUnit("serial", unit=folder) as simulated:
-        outcomes = [run_case(simulated.probe, case) for case in serial_suite(read_unit(folder))]
+    results = list(outcomes("serial", folder))
     assert [
         (o.id, o.expected, o.seen, o.log[-4:])
-        for o in outcomes
+        for o in results
         if o.status != "passed" and ".unjudged." not in o.id
     ] == []
-    assert len(outcomes) >= 45
+    assert len(results) >= 45
 
 
 @pytest.mark.parametrize(

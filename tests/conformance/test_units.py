@@ -20,14 +20,13 @@ from starid.attitude import Attitude
 from tests.conformance.mutant_seams import Damage
 from tests.conformance.mutants_oresat import DAMAGES, DEFINITION_MUTANTS, DefinitionMutant
 from tests.conformance.mutants_units import UnitMutant, gen2, mutants
-from tests.conformance.simulated import SimulatedUnit
+from tests.conformance.simulated import SUITES, SimulatedUnit, healthy_outcomes
 from tests.conformance.test_mutants import MUTANTS
 
 pytestmark = pytest.mark.long
 
 GEN2 = "cubestar-gen2"
 UNITS = ("sagitta", "nos3", "st16", "st200", GEN2)
-SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
 
 
 @cache
@@ -50,8 +49,7 @@ MUTANTS_ON_CAN = [
 
 @pytest.mark.parametrize(("unit", "link"), [*((unit, "serial") for unit in UNITS), (GEN2, "can")])
 def test_a_bundled_unit_passes_every_case_of_its_definition(unit: str, link: str) -> None:
-    with SimulatedUnit(link, unit=unit) as simulated:
-        outcomes = run_cases(simulated.probe, cases_of(unit, link).values())
+    outcomes = healthy_outcomes(link, unit)
     assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
     assert [o.id for o in outcomes if o.status == "skipped" and ".unjudged." not in o.id] == []
     assert len(outcomes) >= 15
@@ -102,8 +100,7 @@ def test_a_mutant_of_a_unit_on_can_is_caught_by_its_case(caught_by: str, damage:
 
 
 def test_a_unit_on_canopen_passes_every_case_that_its_dictionary_has() -> None:
-    with SimulatedUnit("canopen", unit="oresat") as simulated:
-        outcomes = run_cases(simulated.probe, cases_of("oresat", "canopen").values())
+    outcomes = healthy_outcomes("canopen", "oresat")
     assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
     assert {o.id: o.seen for o in outcomes if o.status == "skipped" and ".unjudged." not in o.id} == {
         "canopen.design.attitude": "the EDS has no object named sequence"
