@@ -24,6 +24,13 @@ AXE = (
 )
 """axe-core, which tools/install_test_packages fetches."""
 
+LIVE_HZ = 3
+STILL_HZ = 0.1
+"""Update rates: of the tests that look at images, and of the others."""
+
+still = pytest.mark.usefixtures("still_page")
+"""Marks a test that looks at no image: the next one comes after ten seconds."""
+
 MARKS = [
     pytest.mark.browser,
     pytest.mark.process,
@@ -93,12 +100,14 @@ def fault(page, **levels):
 
 
 def reset(page):
-    """Bring back a page that several tests share: live, at a desk, in its first state, on a device without faults."""
+    """Bring back a page that several tests share: live, at a desk, in its first state, on a device that tracks, without faults."""
     page.set_viewport_size({"width": 1280, "height": 800})
     page.evaluate(
         "starhil.store.scrub(null); starhil.sky.reset(); document.activeElement.blur(); document.querySelectorAll('dialog[open]').forEach((each) => each.close())"
     )
     assert ask(page, do="control", request={"do": "clear_faults"})["ok"]
+    command(page, "set_update_rate", rate=LIVE_HZ)
+    track(page)
 
 
 @contextmanager

@@ -8,15 +8,14 @@ from starhil.emulator.console.viewer import TURN_TEXT
 from tests.emulator.console.browser import (
     AXE,
     MARKS,
+    STILL_HZ,
     SlowLink,
-    chromium,
     command,
-    emulator_with_console,
     fault,
     let_pass,
     opened,
     requests_of,
-    reset,
+    still,
     track,
     wait_for_text,
 )
@@ -28,33 +27,6 @@ SLOW_BYTES_S = 6_000
 
 TABS = ("telemetry", "telecommands", "wire", "events", "faults", "truth")
 WIDTHS = (390, 820, 1280, 1920, 3840)
-
-
-@pytest.fixture(scope="module")
-def emulator():
-    with emulator_with_console(serial="auto", settings=["parameters.update_rate=3"]) as process:
-        yield process
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with chromium() as started:
-        yield started
-
-
-@pytest.fixture(scope="module")
-def shared(browser, emulator):
-    with opened(browser, emulator.ready["view"]) as page:
-        track(page)
-        yield page
-
-
-@pytest.fixture
-def page(shared):
-    """The page of the module, live, at a desk, without faults."""
-    reset(shared)
-    track(shared)
-    return shared
 
 
 def open_tab(page, name):
@@ -129,6 +101,7 @@ def test_what_a_hidden_page_missed_is_filled_when_it_is_shown(page):
     assert numbers == list(range(int(numbers[0]), int(numbers[0]) + len(numbers)))
 
 
+@still
 def test_letters_and_ctrl_enter_act_only_in_their_part(page):
     open_tab(page, "telecommands")
     page.select_option("#telecommand", "set_mode")
@@ -150,6 +123,7 @@ def test_letters_and_ctrl_enter_act_only_in_their_part(page):
     page.wait_for_function("count => document.querySelectorAll('#sent li').length > count", arg=sent)
 
 
+@still
 def test_a_telecommand_that_restarts_or_deletes_asks_first(page):
     open_tab(page, "telecommands")
     for row in ("reset", "format_card", "erase_file"):
@@ -163,6 +137,7 @@ def test_a_telecommand_that_restarts_or_deletes_asks_first(page):
             assert requests() == []
 
 
+@still
 def test_the_form_of_a_level_shows_its_faults_and_injecting_keeps_them(page):
     open_tab(page, "faults")
     fault(page, optical={"false_stars": 5})
@@ -186,6 +161,7 @@ def test_the_form_of_a_level_shows_its_faults_and_injecting_keeps_them(page):
     )
 
 
+@still
 @pytest.mark.parametrize("width", WIDTHS)
 def test_everything_fits_the_width_and_text_is_at_least_12_px(page, width):
     page.set_viewport_size({"width": width, "height": {390: 844, 820: 1180, 3840: 2160}.get(width, 800)})
@@ -205,6 +181,7 @@ def test_everything_fits_the_width_and_text_is_at_least_12_px(page, width):
         assert page.evaluate("document.getElementById('tabs').getBoundingClientRect().bottom <= innerHeight")
 
 
+@still
 @pytest.mark.parametrize("width", [390, 1280])
 def test_no_name_and_unit_is_cut_off(page, width):
     page.set_viewport_size({"width": width, "height": 844})
@@ -217,6 +194,7 @@ def test_no_name_and_unit_is_cut_off(page, width):
     assert cut_off == []
 
 
+@still
 def test_a_telephone_shows_the_whole_image_below_the_header(page):
     page.set_viewport_size({"width": 390, "height": 844})
     page.evaluate("scrollTo(0, 0)")
@@ -226,6 +204,7 @@ def test_a_telephone_shows_the_whole_image_below_the_header(page):
     assert bottom < tabs
 
 
+@still
 def test_text_follows_the_font_size_of_the_browser(page):
     before = page.evaluate("getComputedStyle(document.getElementById('ra')).fontSize")
     page.evaluate("document.documentElement.style.fontSize = '200%'")
@@ -246,6 +225,7 @@ def test_numbers_are_in_no_live_region_and_outcomes_are(page):
     track(page)
 
 
+@still
 def test_messages_are_added_without_making_the_others_again_and_one_opens_with_its_fields(page):
     open_tab(page, "wire")
     page.check("#wire label.check:has-text('console') input")
@@ -325,6 +305,7 @@ def test_a_reconnection_keeps_filter_forms_and_images(page):
     page.fill("#telecommands input[type=search]", "")
 
 
+@still
 def test_a_turn_that_is_no_number_is_said_and_not_sent(page):
     open_tab(page, "truth")
     page.fill("[data-truth=rate] [name=x]", "abc")
@@ -336,6 +317,7 @@ def test_a_turn_that_is_no_number_is_said_and_not_sent(page):
     page.fill("[data-truth=rate] [name=x]", "0")
 
 
+@still
 def test_events_are_listed_and_a_click_shows_the_moment(page):
     open_tab(page, "events")
     page.fill("#events form input", "look here")
@@ -392,21 +374,41 @@ def test_any_telemetry_field_is_plotted_and_a_part_of_the_time_is_enlarged_and_s
 RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa", "best-practice"]
 COLOURS = ["color-contrast", "link-in-text-block"]
 """The rules of RULES that look at colours, in which alone the themes differ."""
-SERIOUS = """async (runOnly) => {
-    const { violations } = await axe.run(document, { resultTypes: ["violations"], runOnly });
+SERIOUS = """async ([part, runOnly]) => {
+    const { violations } = await axe.run(part, { resultTypes: ["violations"], runOnly });
     return violations.filter((each) => ["critical", "serious"].includes(each.impact)).map((each) => [each.id, each.nodes.length, each.nodes[0].target.join(" "), each.nodes[0].failureSummary]);
 }"""
 STATES = ("live", "paused", "covered", "stuck", "standby", "error")
+WHOLE, PANEL, STATE = "html", "#side", "#top, #past, #sky, #active-faults"
+"""Parts of the page: all of it, what differs between tabs, and what between states."""
+
+
+def serious(page, rules, views):
+    """Return what axe finds in views, each of a width, a tab and a part, and change the theme."""
+    gaps = []
+    for width, tab, part in views:
+        page.set_viewport_size({"width": width, "height": 900})
+        open_tab(page, tab)
+        gaps += [(width, tab, *each) for each in page.evaluate(SERIOUS, [part, rules])]
+    page.click("#theme")
+    return gaps
 
 
 @pytest.mark.skipif(not AXE.is_file(), reason="no axe-core: tools/install_test_packages tests, with npm")
 @pytest.mark.parametrize("state", STATES)
 def test_axe_finds_nothing_serious(page, state):
-    """Every panel and every width of a live page, a panel in the other states; colours in both themes."""
-    if state == "covered":
+    """A live page whole, each of its panels and narrow widths; in the other states what they change. Colours in both themes."""
+    if not page.evaluate("Boolean(window.axe)"):
+        page.evaluate(AXE.read_text())
+    gaps, views = [], [(1280, "faults", STATE)]
+    if state == "live":
+        gaps = serious(page, RULES, [(1280, "faults", WHOLE)])
+        views = [(1280, tab, PANEL) for tab in TABS] + [(390, "telecommands", WHOLE), (820, "wire", WHOLE)]
+    elif state == "covered":
         fault(page, optical={"blank": True})
         wait_for_text(page, "#validity", "too few stars")
-    elif state == "stuck":
+    command(page, "set_update_rate", rate=STILL_HZ)
+    if state == "stuck":
         fault(page, device={"stuck": True})
         page.wait_for_selector("body.past")
     elif state == "standby":
@@ -417,22 +419,7 @@ def test_axe_finds_nothing_serious(page, state):
         wait_for_text(page, "#mode", "error: sensor")
     elif state == "paused":
         page.click("#live")
-    if not page.evaluate("Boolean(window.axe)"):
-        page.evaluate(AXE.read_text())
-    everywhere = state == "live"
-    if everywhere:
-        command(
-            page, "set_update_rate", rate=1
-        )  # also for the other states: images take half of the processor
-    panels = [(1280, tab) for tab in (TABS if everywhere else ("faults",))]
-    widths = [(width, "telecommands") for width in WIDTHS if everywhere and width != 1280]
-    gaps = []
-    for rules, views in ((RULES, panels + widths), (COLOURS, panels + widths[:1])):
-        page.click("#theme")
-        for width, tab in views:
-            page.set_viewport_size({"width": width, "height": 900})
-            open_tab(page, tab)
-            gaps += [(width, tab, *each) for each in page.evaluate(SERIOUS, rules)]
+    gaps += serious(page, RULES, views) + serious(page, COLOURS, views)
     if state == "error":
         command(page, "set_mode", mode="standby")
     assert gaps == []

@@ -4,10 +4,7 @@ import math
 
 import pytest
 
-from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.rig.private_can_bus import private_can_bus
-from tests.emulator.console.browser import MARKS
-from tests.emulator.console.test_browser import browser, page, send, shared  # noqa: F401 (fixtures)
+from tests.emulator.console.browser import MARKS, command, emulator_with_console, opened
 
 pytestmark = MARKS
 
@@ -17,24 +14,24 @@ SETTINGS = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def emulator():
-    with private_can_bus() as bus:
-        command = emulator_command(
-            profile="ideal", serial="off", can=bus, seed=1, settings=list(SETTINGS), extra=["--view", "auto"]
-        )
-        with EmulatorProcess(command) as process:
-            yield process
+@pytest.fixture
+def page(browser):
+    with (
+        emulator_with_console(settings=list(SETTINGS)) as emulator,
+        opened(browser, emulator.ready["view"]) as page,
+    ):
+        yield page
 
 
-def test_features_region_and_removed_detections_are_shown(page):  # noqa: F811
+def test_features_region_and_removed_detections_are_shown(page):
     assert page.locator("#features").is_hidden()
-    send(page, "set_mode", mode="lost_in_space")
+    command(page, "set_mode", mode="lost_in_space")
     page.wait_for_function(
         "() => { const known = starhil.store.image && starhil.store.image.head.features;"
         " return known && known.search === 'rsi' && known.removed.length >= 3; }"
     )
     page.click("#live")  # nothing changes any more
+    command(page, "set_mode", mode="standby")
     shown = page.evaluate("() => starhil.store.image.head.features")
     page.wait_for_function(
         "text => document.querySelector('#features p').textContent.includes(text)",
