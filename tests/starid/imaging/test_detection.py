@@ -393,19 +393,19 @@ def test_trails_of_few_faint_stars_are_followed() -> None:
 
     Of 30 images, 23 showed no trails when six stars or more had to agree on them.
     """
-    followed = 0
-    for seed in range(30):
+    followed, images = 0, 15
+    for seed in range(images):
         image, _, path = few_trails(seed)
         trail_px = detect(image, KNOWN).trail_px
         followed += trail_px > 0.0
         assert trail_px == 0.0 or trail_px == pytest.approx(np.linalg.norm(path), rel=0.35)
-    assert followed >= 16
+    assert followed >= images // 2
 
 
 def test_the_width_of_few_spots_is_measured_among_hot_pixels_beside_a_dark_body() -> None:
     """Hot pixels and the edge are more than the stars; a spot taken for too narrow states too small an error."""
     shape, width, squares = (400, 400), 1.2, []
-    for seed in range(30):
+    for seed in range(15):
         rng = np.random.default_rng((13, seed))
         places = scattered(8, shape, seed, gap=40.0)
         light = spots(shape, places, np.geomspace(600, 250, 8), width)
@@ -421,14 +421,14 @@ def test_the_width_of_few_spots_is_measured_among_hot_pixels_beside_a_dark_body(
         number, _ = matched(found, bare, 3.0)
         error = found.xy_px[number[number >= 0]] - bare[number >= 0]
         squares += (np.square(error / found.xy_sigma_px[number[number >= 0]])).mean(axis=1).tolist()
-    assert len(squares) >= 90
+    assert len(squares) >= 45
     assert np.mean(squares) == pytest.approx(1.0, abs=4.0 / math.sqrt(len(squares)))
 
 
 def test_a_dark_body_does_not_displace_the_stars_beside_it() -> None:
     """The sky ends at its edge: a grid of blocks on either side would make a slope of it."""
     shape, squares = (400, 400), []
-    for seed in range(20):
+    for seed in range(10):
         rng = np.random.default_rng((14, seed))
         places = np.column_stack([rng.uniform(170.0, 192.0, 10), np.arange(20.0, 400.0, 38.0)])
         image = photograph(spots(shape, places, 400.0, 1.2), seed)
@@ -437,7 +437,7 @@ def test_a_dark_body_does_not_displace_the_stars_beside_it() -> None:
         number, _ = matched(found, places, 3.0)
         error = found.xy_px[number[number >= 0]] - places[number >= 0]
         squares += np.square(error / found.xy_sigma_px[number[number >= 0]]).mean(axis=1).tolist()
-    assert len(squares) > 190
+    assert len(squares) > 95
     assert np.mean(squares) == pytest.approx(1.0, abs=4.0 / math.sqrt(len(squares)))
 
 

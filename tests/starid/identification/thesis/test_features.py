@@ -51,7 +51,7 @@ stars = st.lists(
 )
 
 
-@settings(deadline=None, derandomize=True, max_examples=60)
+@settings(deadline=None, derandomize=True, max_examples=30)
 @given(stars, st.floats(0.0, 360.0))
 def test_rotating_the_frame_changes_only_theta(values, angle):
     a, x, y = np.array(values).T

@@ -69,7 +69,7 @@ def objective(dictionary, observation, penalty, omega):
 def test_lasso_path_is_at_least_as_good_as_scikit_learns():
     lsi = lost_in_space(99.5)
     weights = np.empty((LAMBDAS.size, 9))
-    for observation in observations(99.5, 340, 0.07):
+    for observation in observations(99.5, 680, 0.07):
         solution = lsi.solve_normalised(observation)
         dictionary = solution.dictionary
         assert lasso_path(dictionary, observation, LAMBDAS, weights)

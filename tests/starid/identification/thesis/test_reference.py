@@ -88,7 +88,7 @@ def test_the_solver_of_scikit_learn_finds_the_cells_and_weights_of_the_compiled_
     compiled, reference = (
         LostInSpace(made, precision=precision, solver=name) for name in ("exact", "sklearn")
     )
-    for ra, dec in ((115.0, -65.0), (201.7, 40.2), (359.1, -20.6), (37.3, 11.9)):
+    for ra, dec in ((115.0, -65.0), (359.1, -20.6)):
         observation = made.normalise(made.sky.features(ra, dec))
         ours, theirs = (lsi.solve_normalised(observation) for lsi in (compiled, reference))
         assert theirs.nearest == ours.nearest

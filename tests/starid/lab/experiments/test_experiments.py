@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from starid.cli.app import build_app
 from starid.errors import StaridError
 from starid.identification.thesis.frame_grid import make_grid
-from starid.lab.experiments import registry, report, runner, tables
+from starid.lab.experiments import figures, registry, report, runner, tables
 from starid.lab.experiments.comparison import (
     Outcome,
     Published,
@@ -424,7 +424,13 @@ def test_all_test_frames_are_on_the_grid_and_moved_ones_are_not():
             assert 0.2 < away.mean() < 0.3
 
 
-def test_the_quick_run_of_the_accuracy_evaluates_fewer_frames(tmp_path):
+def test_the_quick_run_of_the_accuracy_evaluates_fewer_frames(tmp_path, monkeypatch):
+    def without_pixels(figure, path):
+        figure.clear()
+        path.touch()
+        return path.name
+
+    monkeypatch.setattr(figures, "save", without_pixels)
     accuracy = registry.experiments()["lsi-accuracy"]
     context = Context(tmp_path, tmp_path, "lsi-accuracy", 1, accuracy.quick, quick=True)
     parts, results, rng = accuracy.parts(accuracy.quick), {}, np.random.default_rng(1)
