@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import re
@@ -11,7 +13,6 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 
@@ -71,7 +72,7 @@ def fmu3(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return export("3", tmp_path_factory.mktemp("fmü3"))  # the path of the profile is not ASCII
 
 
-@contextmanager
+@contextlib.contextmanager
 def refused(function: str) -> Iterator[None]:
     """The FMU itself answers a call of this function with the status of an error."""
     with pytest.raises(FMICallException) as caught:
@@ -108,7 +109,7 @@ def simulate(path: Path, inputs: np.ndarray, step_s: float = STEP_S, **parameter
     )  # fmt: skip
 
 
-@contextmanager
+@contextlib.contextmanager
 def stepped_emulator(folder: Path, profile: Path) -> Iterator[dict[str, str]]:
     """An emulator in lock-step, as the parameters with which an FMU connects to it."""
     command = emulator_command(
@@ -218,7 +219,7 @@ class Unit:
         self.time += STEP_S
 
 
-@contextmanager
+@contextlib.contextmanager
 def unit_of(path: Path, folder: Path, **parameters: object) -> Iterator[Unit]:
     unit = Unit(path, folder, **parameters)
     try:
@@ -375,7 +376,6 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
     ("parameters", "message"),
     [
         ({"command": "/does/not/exist"}, "/does/not/exist does not start: No such file"),
-        ({"profile": "wrong.toml"}, "does not start: .*wrong.toml.*: camera.widht: unknown key"),
         (
             {"feed": "127.0.0.1:1", "control": "unix:/none"},
             "no emulator at 127.0.0.1:1 and unix:/none: .*Connection refused",
@@ -383,12 +383,8 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
     ],
 )
 def test_what_does_not_start_says_why(
-    fmu3: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parameters: dict[str, object], message: str
+    fmu3: Path, tmp_path: Path, parameters: dict[str, object], message: str
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("wrong.toml").write_text(
-        f"extends = '{fmu3.parent / QUICK}'\n[run]\nworker = 'error_model'\n[camera]\nwidht = 5\n"
-    )
     with unit_of(fmu3, tmp_path, **parameters) as unit:
         with refused("fmi3ExitInitializationMode"):
             unit.begin()
@@ -538,12 +534,7 @@ def test_the_program_of_the_docs_prints_what_they_show(fmu3: Path, tmp_path: Pat
     page = (Path(__file__).parents[2] / "docs" / "fmu.md").read_text(encoding="utf-8")
     program, shown = re.search(r"```python\n(.*?)```\n\n```text\n(.*?)```", page, re.DOTALL).groups()
     shutil.copy(fmu3, tmp_path / "startracker.fmu")
-    done = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE_S,
-    )
-    assert done.stdout.splitlines()[-1:] == shown.splitlines(), done.stderr
+    printed = io.StringIO()
+    with contextlib.chdir(tmp_path), contextlib.redirect_stdout(printed):
+        exec(compile(program, "fmu.md", "exec"), {})
+    assert printed.getvalue().splitlines()[-1:] == shown.splitlines()

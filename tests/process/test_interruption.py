@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import socket
@@ -15,15 +14,12 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
-from tests.process.conftest import NO_IMAGES, NO_IMAGES_OPTIONS
+from tests.process.conftest import NO_IMAGES_OPTIONS
 from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
 
-SESSION = (
-    f"[emulator]\nset = {json.dumps(NO_IMAGES)}\n"
-    "[[step]]\nread = 'identification'\n[[step]]\nwait_s = 600\n[[step]]\nread = 'device_status'\n"
-)
+SESSION = "[[step]]\nread = 'identification'\n[[step]]\nwait_s = 600\n[[step]]\nread = 'device_status'\n"
 
 
 @pytest.fixture(autouse=True)
@@ -88,14 +84,20 @@ def interrupt(words: list, number: signal.Signals, folder: Path, processes: int)
     ids=str,
 )
 def test_a_signal_leaves_no_process_and_no_folder_behind(name, number, tmp_path):
-    script, junit, html, scratch = (tmp_path / each for each in ("s.toml", "j.xml", "c.html", "scratch"))
+    script, quick, junit, html, scratch = (
+        tmp_path / each for each in ("s.toml", "quick.toml", "j.xml", "c.html", "scratch")
+    )
     scratch.mkdir()
     script.write_text(SESSION, encoding="ascii")
+    quick.write_text("[run]\nworker = 'error_model'\n[camera]\ndistortion = []\n")
     words = {
         "session": ["session", script, "--log", tmp_path / "log"],
         "conformance": ["conformance", "serial.data", "serial.modes", "--html", html, "--verbose"],
     }[name]
-    processes = {"session": 1, "conformance": 2}[name]  # the emulator, and its worker if there are images
+    if number is signal.SIGKILL:
+        processes = 2  # the emulator, and the worker that makes its images
+    else:
+        words, processes = [*words, "--profile", quick], 1
     status = interrupt([*words, "--start", "--serial", "auto", "--junit", junit], number, scratch, processes)
     if number is signal.SIGKILL:
         with temporary_folder("starhil-", base=scratch):  # the next run clears away what this one could not
