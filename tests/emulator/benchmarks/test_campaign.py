@@ -65,7 +65,7 @@ def test_an_interrupted_campaign_resumes_where_it_stopped(tmp_path):
 
 @pytest.mark.process
 def test_a_killed_campaign_resumes_with_the_same_figures(tmp_path):
-    words = ["campaign", "lost-in-space", "--frames", "100", "--seed", "3", "--json"]
+    words = ["campaign", "lost-in-space", "--frames", "60", "--seed", "3", "--json"]
 
     def run(folder: Path, jobs: int) -> dict[str, object]:
         status, out, said = run_command_line(*words, "--jobs", str(jobs), "-o", str(folder))
@@ -85,7 +85,7 @@ def test_a_killed_campaign_resumes_with_the_same_figures(tmp_path):
     for name, value in whole.items():
         if "_ms" not in name:
             assert figures[name] == pytest.approx(value), name
-    assert figures["frames"] == 100
+    assert figures["frames"] == 60
 
 
 def test_a_hard_sky_is_never_answered_wrongly():

@@ -22,7 +22,7 @@ from tests.emulator.cli.command_line import run_command_line
 
 pytestmark = [pytest.mark.long, pytest.mark.lowest("joblib")]
 
-FRAMES = 16
+FRAMES = 10
 EXACT = [name for name in RECORD.names or () if not name.endswith("_ms")]
 
 

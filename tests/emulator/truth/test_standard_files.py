@@ -220,7 +220,7 @@ def test_a_ck_has_the_attitudes_that_spice_gives(
     source = write(tmp_path, text)
     done = run_command_line("truth", "convert", str(source), "-o", "out.tm", "--structure", "-44007")
     assert done == (0, "", "")
-    truth = read_truth_file(Path("out.tm"))
+    original, truth = read_truth_file(source), read_truth_file(Path("out.tm"))
     assert truth.start_unix_s == pytest.approx(START_UNIX_S, abs=1e-6)
     assert (truth.rates_rad_s is not None) == with_rates
     spice.furnsh("out.tm")
@@ -229,17 +229,10 @@ def test_a_ck_has_the_attitudes_that_spice_gives(
             ticks = spice.sce2c(-44, spice.str2et(START) + t)
             spice_says = Attitude.from_matrix(spice.ckgp(-44007, ticks, 0.0, "J2000")[0])
             assert truth.state(float(t)).attitude.error_to(spice_says).total_arcsec < MILLIARCSECOND
-            assert (
-                read_truth_file(source)
-                .state(float(round(t)))
-                .attitude.error_to(
-                    Attitude.from_matrix(
-                        spice.ckgp(-44007, spice.sce2c(-44, spice.str2et(START) + round(t)), 1.0, "J2000")[0]
-                    )
-                )
-                .total_arcsec
-                < MILLIARCSECOND
-            )
+            ticks = spice.sce2c(-44, spice.str2et(START) + round(t))
+            spice_says = Attitude.from_matrix(spice.ckgp(-44007, ticks, 1.0, "J2000")[0])
+            at_record = original.state(float(round(t))).attitude
+            assert at_record.error_to(spice_says).total_arcsec < MILLIARCSECOND
     finally:
         spice.kclear()
 
@@ -311,7 +304,7 @@ def test_interpolation_follows_an_analytic_slew(
     kind = "QUATERNION/ANGVEL" if with_rates else "QUATERNION"
     rows = rows if with_rates else [" ".join(row.split()[:5]) for row in rows]
     truth = read_truth_file(write(tmp_path, aem(kind, rows)))
-    worst = worst_arcsec(truth, np.arange(0.0, 250.0, 0.1).tolist())
+    worst = worst_arcsec(truth, np.arange(0.0, 250.0, 0.25).tolist())
     assert bound_arcsec / 10.0 < worst < bound_arcsec
 
 

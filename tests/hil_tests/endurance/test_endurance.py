@@ -75,26 +75,16 @@ def test_no_life_ends_in_a_violation(unit):
     assert sum(outcome.device_s for outcome in outcomes) > 1800.0
 
 
-def test_a_life_whose_images_are_rendered_ends_without_a_violation():
-    outcome = run_once(replace(life_of("sagitta", 5, 8), rendered=True))
-    assert outcome.violation == ""
-    assert outcome.attitudes > 0
-
-
-def test_a_rendering_process_that_is_killed_is_an_error_until_its_successor_is_ready_also_on_a_full_disk():
-    steps = (
-        {"do": "wait", "s": 3.0},
-        READ_MODE,
-        {"do": "end_pipeline"},
-        READ_MODE,
-        {"do": "wait", "s": 3.0},
-        READ_MODE,
-        {"do": "disk", "full": True},
-        {"do": "end_pipeline"},
-        READ_MODE,
-    )
-    outcome = run_once(Life("cubestar", 1, ("serial",), {}, steps, rendered=True))
-    assert (outcome.violation, outcome.readings) == ("", 4)
+def test_a_life_whose_images_are_rendered_goes_on_after_the_end_of_their_process_on_a_full_disk_too():
+    """Until the successor is ready, the mode is an error; attitudes before that, and under new power, are right."""
+    attitude = request_on("serial", load_unit("cubestar").telemetry["precise_attitude"])
+    wait, full, free = {"do": "wait", "s": 3.0}, *({"do": "disk", "full": full} for full in (True, False))
+    killed = ({"do": "end_pipeline"}, READ_MODE)
+    power = {"do": "power", "factory": False}
+    steps = (wait, attitude, *killed, wait, READ_MODE, full, *killed, free, power, wait, attitude)
+    profile = {"parameters": {"start_mode": "lost_in_space"}}
+    outcome = run_once(Life("cubestar", 1, ("serial",), profile, steps, rendered=True))
+    assert (outcome.violation, outcome.readings, outcome.attitudes) == ("", 5, 2)
 
 
 def test_a_pipeline_that_is_given_up_is_a_violation_of_its_life_alone(monkeypatch):
@@ -329,7 +319,7 @@ def test_a_seed_gives_one_life_and_one_outcome_whatever_the_hash_seed_is():
     assert life_of("cubestar", 3) != life_of("cubestar", 4)
     program = (
         "from tests.hil_tests.endurance.test_endurance import life_of, run_once\n"
-        "print(life_of('cubestar', 3), run_once(life_of('oresat', 1)), sep='\\n')"
+        "print(life_of('cubestar', 3), run_once(life_of('oresat', 1, 40)), sep='\\n')"
     )
     environment = {**os.environ, "PYTHONHASHSEED": "1"}
     elsewhere = subprocess.run(
@@ -340,9 +330,9 @@ def test_a_seed_gives_one_life_and_one_outcome_whatever_the_hash_seed_is():
         text=True,
         check=True,
     )
-    outcome = outcome_of("oresat", 1)
+    outcome = run_once(life_of("oresat", 1, 40))
     assert elsewhere.stdout == f"{life_of('cubestar', 3)}\n{outcome}\n"
-    assert (outcome.violation, outcome.step) == ("", STEPS - 1)
+    assert (outcome.violation, outcome.step) == ("", 39)
 
 
 @pytest.mark.parametrize("kind", ["usual", "long", "rendered"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -32,9 +33,13 @@ def sunlight_photons_s_m2() -> float:
     return math.pi * math.radians(959.63 / 3600.0) ** 2 * float(trapezoid(radiance, wave))
 
 
+painter = lru_cache(2)(AreaPainter)
+"""Which computes once where each pixel of a camera looks."""
+
+
 def light(objects: SkyObjects, sensor: SensorModel = SENSOR, camera: Camera = CAMERA) -> np.ndarray:
     """Electrons/s in each pixel (h, w), without sky and dark current."""
-    area = AreaPainter(camera, sensor.zero_magnitude_e_s, sensor.psf_sigma_px).paint(objects, ORION)
+    area = painter(camera, sensor.zero_magnitude_e_s, sensor.psf_sigma_px).paint(objects, ORION)
     zero = np.zeros((camera.height, camera.width), dtype=np.float32)
     mean = zero.copy()
     area.draw(mean, Backdrop(zero, np.ones_like(zero), sky_e_s=0.0, exposure_s=1.0))
