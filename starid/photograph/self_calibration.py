@@ -186,12 +186,12 @@ def calibrate_identified(
         )
     start = solutions[indices[0]].camera or camera
     _, result = next(_calibrations(matched, start, (_affordable_model(matched, ("focal", "k1")), ("focal",))))
-    bright = sky.brighter_than(faintest + _MAGNITUDE_MARGIN)
     reach = result.camera.field_radius_rad * _FIELD_MARGIN
-    fields = [bright.in_cone(attitude.boresight, reach) for attitude in result.attitudes]
-    references = merge_close_stars(
-        bright.subset(np.unique(np.concatenate(fields))), _BLEND_PX * camera.pixel_scale_rad
+    seen = np.unique(
+        np.concatenate([sky.in_cone(attitude.boresight, reach) for attitude in result.attitudes])
     )
+    seen = seen[sky.v[seen] <= faintest + _MAGNITUDE_MARGIN]
+    references = merge_close_stars(sky.subset(seen), _BLEND_PX * camera.pixel_scale_rad)
     matches: tuple[Indices, ...] = ()
     for _ in range(_ROUNDS):
         pairs = [
