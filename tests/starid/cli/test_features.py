@@ -16,7 +16,7 @@ runner = CliRunner()
 
 
 def call(*arguments):
-    return runner.invoke(build_app(), list(arguments), catch_exceptions=True)
+    return runner.invoke(build_app(arguments), list(arguments), catch_exceptions=True)
 
 
 def test_published_features():

@@ -26,11 +26,11 @@ DEGREE_LIMIT = 0.01
 
 
 def starid(*arguments: str):
-    return RUNNER.invoke(build_app(), list(arguments), catch_exceptions=True)
+    return RUNNER.invoke(build_app(arguments), list(arguments), catch_exceptions=True)
 
 
 def starhil(*arguments: str):
-    return RUNNER.invoke(emulator.build_app(), list(arguments), catch_exceptions=True)
+    return RUNNER.invoke(emulator.build_app(arguments), list(arguments), catch_exceptions=True)
 
 
 def answer(path, *options: str) -> dict:

@@ -175,7 +175,7 @@ def test_a_wrong_start_is_recovered_from_and_gross_answers_are_outvoted():
     for memory in (0, 15):
         recursion = RecursiveIdentification(lsi, TrackFilter(settings), RsiSettings(memory=memory))
         sequence = sky_sequence(
-            np.random.default_rng(7), lsi.database.sky, 108.41, 12.14, noise, count=150, wander=True
+            np.random.default_rng(7), lsi.database.sky, 108.41, 12.14, noise, count=100, wander=True
         )
         errors[memory] = []
         for frame in sequence:

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.long
 DEGREE_ARCSEC = 3600.0
 LIMIT = 5.5
 CAMERA = Camera.from_fov(42.0)
-FRAMES = 12
+FRAMES = 10
 CORNERS = [
     Attitude.from_radec_roll(ra, dec, roll)
     for ra, dec, roll in (

@@ -355,7 +355,7 @@ def _finished(rows):
 
 
 def _invoke(*arguments: str):
-    return CliRunner().invoke(build_app(), ["reproduce", *arguments])
+    return CliRunner().invoke(build_app(["reproduce"]), ["reproduce", *arguments])
 
 
 @pytest.mark.parametrize(("least", "known", "status"), [(-1e9, False, 0), (1e9, False, 1), (1e9, True, 0)])

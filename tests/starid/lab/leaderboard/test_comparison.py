@@ -86,7 +86,7 @@ def test_a_row_does_not_depend_on_the_rows_before_it(monkeypatch: pytest.MonkeyP
 def test_json_is_one_object_and_repeats_with_the_seed() -> None:
     runner = CliRunner()
     words = ["bench", "--frames", "3", "--seed", "9", "--row", "2, 5, 3", "--json"]
-    first, second = (json.loads(runner.invoke(build_app(), words).stdout) for _ in range(2))
+    first, second = (json.loads(runner.invoke(build_app(words), words).stdout) for _ in range(2))
     assert first["seed"] == 9
     assert first["versions"].keys() == {"geometric"}
     for one, other in zip(first["rows"], second["rows"], strict=True):

@@ -290,7 +290,7 @@ def test_the_command_writes_report_data_and_pictures(tmp_path, oracle) -> None:
         str(tmp_path / "board"),
         "--json",
     ]
-    result = CliRunner().invoke(build_app(), words)
+    result = CliRunner().invoke(build_app(words), words)
     assert result.exit_code == 0
     assert json.loads(result.stdout)["rows"][0]["valid_pct"] == 100.0
     assert {path.name for path in (tmp_path / "board").iterdir()} == {
