@@ -43,6 +43,8 @@ ERROR = 3
 LOCK_STEP = [
     *("truth.kind=live", "truth.protocol=tcp", "truth.port=0", "truth.lockstep=true", "run.clock=stepped"),
 ]
+WRONG = "wrong.toml"
+"""Profile in the working folder with a key that there is not; it names no images, so that nothing renders them ahead."""
 QUICK = "quick.toml"
 """Profile beside an FMU that starts quickly, as images do not matter."""
 WITHIN_3_SIGMA = 0.9973
@@ -376,6 +378,7 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
     ("parameters", "message"),
     [
         ({"command": "/does/not/exist"}, "/does/not/exist does not start: No such file"),
+        ({"profile": WRONG}, f"starhil does not start: .*{WRONG}: camera.widht: unknown key"),
         (
             {"feed": "127.0.0.1:1", "control": "unix:/none"},
             "no emulator at 127.0.0.1:1 and unix:/none: .*Connection refused",
@@ -383,8 +386,10 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
     ],
 )
 def test_what_does_not_start_says_why(
-    fmu3: Path, tmp_path: Path, parameters: dict[str, object], message: str
+    fmu3: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, parameters: dict[str, object], message: str
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(WRONG).write_text("[run]\nworker = 'error_model'\n[camera]\nwidht = 5\n")
     with unit_of(fmu3, tmp_path, **parameters) as unit:
         with refused("fmi3ExitInitializationMode"):
             unit.begin()
