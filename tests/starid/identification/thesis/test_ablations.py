@@ -135,9 +135,9 @@ def test_features_of_another_image_find_nothing():
 
 
 def test_features_of_another_image_leave_the_region_useless():
-    valid, in_region = slew(0.5)
+    valid, in_region = slew(2.0)
     assert in_region >= least(FROM_REGION)
-    ablated, ablated_in_region = slew(0.5, part="features")
+    ablated, ablated_in_region = slew(2.0, part="features")
     assert costs(in_region, ablated_in_region)
     assert costs(valid_count(valid), valid_count(ablated))
 

@@ -41,8 +41,14 @@ def lsi():
 
 
 @functools.cache
-def rsi():
+def made_rsi():
     return RsiIdentifier()
+
+
+def rsi():
+    """One that remembers nothing."""
+    made_rsi().reset()
+    return made_rsi()
 
 
 @functools.cache
@@ -166,7 +172,6 @@ def sequence(seed, images=25, magnitude_sigma=0.1, false_stars=15):
     """Errors, arcseconds (NaN: invalid), of images of a turning sensor; the statistics."""
     rng = np.random.default_rng(seed)
     recursion = rsi()
-    recursion.reset()
     tracker = Tracker(recursion)
     attitude = random_attitude(rng)
     errors = []
@@ -210,7 +215,7 @@ def test_while_the_features_disagree_the_whole_database_is_searched():
 
 
 def test_the_reported_motion_is_that_of_the_boresight_on_the_sphere():
-    rng, recursion = np.random.default_rng(10), RsiIdentifier()
+    rng, recursion = np.random.default_rng(10), rsi()
     attitude = random_attitude(rng)
     recursion.identify(*points(rng, attitude))
     turned = propagate(attitude, np.radians([0.0, 2.0, 1.0]), 1.0)
@@ -230,7 +235,7 @@ def test_the_reported_motion_is_that_of_the_boresight_on_the_sphere():
 def test_rsi_with_a_wrong_prediction_searches_the_whole_sky():
     rng = np.random.default_rng(7)
     attitude = Attitude.from_radec_roll(80.0, 10.0, 0.0)
-    recursion = RsiIdentifier()
+    recursion = rsi()
     recursion.identify(*points(rng, attitude))
     elsewhere = Attitude.from_radec_roll(150.0, 30.0, 0.0)  # no motion that the filter could measure
     solution = recursion.track(*points(rng, elsewhere), Attitude.from_radec_roll(250.0, -40.0, 0.0))
@@ -252,7 +257,7 @@ def test_a_change_of_exposure_does_not_lose_the_attitude():
 def test_after_a_reset_the_answer_is_the_first_one():
     rng = np.random.default_rng(8)
     before, frame = (points(rng, random_attitude(rng)) for _ in range(2))
-    recursion = RsiIdentifier()
+    recursion = rsi()
     for identifier, search in ((lsi(), lsi()), (recursion, recursion.lsi)):
         reports = []
         for _ in range(2):
@@ -279,7 +284,7 @@ def test_both_are_star_identifiers_by_name():
         assert isinstance(make_identifier(name), StarIdentifier)
 
 
-@pytest.mark.parametrize("make", [lsi, lambda: RsiIdentifier()])
+@pytest.mark.parametrize("make", [lsi, rsi])
 def test_bad_input(make):
     identifier = make()
     assert identifier.identify(np.empty((0, 2)), np.empty(0)).reason is Reason.TOO_FEW_STARS
@@ -295,13 +300,13 @@ def test_bad_input(make):
 
 @pytest.mark.parametrize("window", [np.nan, -1.0, 0.0, np.inf])
 def test_an_invalid_window_is_rejected(window):
-    recursion = RsiIdentifier()
+    recursion = rsi()
     with pytest.raises(StaridError, match=r"tracking window_px: must be a positive number of pixels, not "):
         recursion.track(np.empty((0, 2)), np.empty(0), Attitude.identity(), window_px=window)
 
 
 def test_a_window_wider_than_the_field_searches_the_field():
-    recursion = RsiIdentifier()
+    recursion = rsi()
     recursion.track(np.empty((0, 2)), np.empty(0), Attitude.identity(), window_px=1e5)
     assert recursion.statistics.region_sum_deg == recursion.lsi.database.parameters.fov_deg
 
