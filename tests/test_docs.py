@@ -32,7 +32,7 @@ from starhil.emulator.sensor.renderer import render
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.truth.csv_file import BOUNDS
 from starhil.emulator.truth.source import TruthStatus
-from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.rig.emulator_process import emulator_command
 from starhil.hil_tests.rig.private_can_bus import hub_thread, private_can_bus
 from starhil.protocol.can.frame import CanFrame
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
@@ -42,6 +42,7 @@ from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from tests.emulator.cli.command_line import run_command_line
+from tests.emulator.emulator_thread import EmulatorThread
 from tests.process.conftest import NO_IMAGES, NO_IMAGES_OPTIONS
 from tests.typed_pages import DOCS, PAGES, UNASKED, Block, assert_shown, blocks
 from tests.waiting import PATIENCE_S
@@ -309,8 +310,8 @@ def unit(bus, tmp_path_factory):
         state_dir=tmp_path_factory.mktemp("state"),
         extra=["--canopen", "5"],
     )
-    with EmulatorProcess(command) as process:
-        yield process.ready
+    with EmulatorThread(command) as emulator:
+        yield emulator.ready
 
 
 def python_can(channel: str) -> dict[str, str | int]:
@@ -361,7 +362,6 @@ def test_walkthrough_program(heading, unit, tmp_path):
     check_program(heading, unit, tmp_path)
 
 
-@pytest.mark.process
 @pytest.mark.parametrize("name", PAGES)
 def test_frames_that_a_page_types_are_answered_as_shown(name, tmp_path):
     page = PAGES[name]
@@ -371,7 +371,7 @@ def test_frames_that_a_page_types_are_answered_as_shown(name, tmp_path):
         typed = shlex.split(page.run.replace("vcan0", hub))
         assert typed[:2] == ["starhil", "run"]
         stack.enter_context(
-            EmulatorProcess(emulator_command(state_dir=tmp_path, extra=[*typed[2:], *NO_IMAGES_OPTIONS]))
+            EmulatorThread(emulator_command(state_dir=tmp_path, extra=[*typed[2:], *NO_IMAGES_OPTIONS]))
         )
         own = stack.enter_context(can.Bus(**python_can(hub)))
         for exchange in page.exchanges:
