@@ -81,16 +81,25 @@ def test_arrays_are_loaded_unchanged_and_read_only(stored: Path) -> None:
     ],
     ids=["empty", "foreign", "header", "half", "one byte", "one bit", "no key", "absurd length", "deep"],
 )
-def test_a_damaged_file_is_reported_and_built_again(
+def test_a_damaged_file_is_reported(
     stored: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage, message: str
 ) -> None:
-    good = stored.read_bytes()
     path = tmp_path / stored.name
-    path.write_bytes(damage(good))
+    path.write_bytes(damage(stored.read_bytes()))
+    with caplog.at_level(logging.WARNING):
+        assert index_file.load(path, key_of(stored)) is None
+    assert str(path) in caplog.text
+    assert message in caplog.text
+
+
+def test_a_damaged_file_is_built_again(
+    stored: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    good, path = stored.read_bytes(), tmp_path / stored.name
+    path.write_bytes(good[:-1])
     with caplog.at_level(logging.WARNING):
         identifier = made(tmp_path)
     assert str(path) in caplog.text
-    assert message in caplog.text
     assert path.read_bytes() == good
     attitude = Attitude.from_radec_roll(80.0, 10.0, 30.0)
     xy, flux, _ = sky(attitude, camera=CAMERA, limit=4.0, identified=identifier)
