@@ -38,9 +38,9 @@ from starhil.hil_tests.conformance.runner import Outcome, run_case
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite, settings_of
 from starhil.hil_tests.judge.canopen import entries
-from starhil.hil_tests.judge.definition import read_unit
+from starhil.hil_tests.judge.definition import read_unit, unit_of
 from starhil.protocol.export import eds
-from starhil.protocol.files.bundled import DEFAULT_UNIT
+from starhil.protocol.files.bundled import DEFAULT_UNIT, find_unit
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd.conventions import NANOSECONDS
 from starhil.protocol.transports.paced import PacedTransport
@@ -190,7 +190,9 @@ class SimulatedUnit:
         self.kind = link
         self.dialect = dialect
         self.icd = icd or load_unit(unit)
-        self.judged = read_unit(unit)
+        self.judged = (
+            read_unit(unit) if icd is None and isinstance(unit, str) else unit_of(self.icd, find_unit(unit))
+        )
         self._served = self.icd if served is None else load_unit(served)
         self._damage = damage
         self._parameters = parameters or {}
