@@ -211,6 +211,9 @@ def test_the_page_can_be_paused_scrubbed_and_set_live_again_by_keys(page):
     page.wait_for_function("() => starhil.store.images.length >= 4")
     page.keyboard.press("Space")
     page.wait_for_selector("body.paused")
+    page.wait_for_function(  # no row that was on its way is shown in place of the one before it any more
+        "() => starhil.store.rows.at(starhil.store.rows.end - 1, 'run_s') > starhil.store.cursor"
+    )
     frame = "starhil.store.rows.at(starhil.store.position, 'frame')"
     before = page.evaluate(frame)
     page.keyboard.press("ArrowLeft")
