@@ -36,7 +36,7 @@ def written(folder, streams_by_itself=False):
 
 
 def test_the_unit_of_the_page_has_no_errors_and_the_exchange_that_is_shown(tmp_path):
-    result = CliRunner().invoke(build_app(), ["unit", "check", str(written(tmp_path / "lynx"))])
+    result = CliRunner().invoke(build_app(["unit"]), ["unit", "check", str(written(tmp_path / "lynx"))])
     assert result.exit_code == 0, result.output
     shown = next(block for block in blocks(PAGE) if block.heading == "Check it" and block.language == "text")
     example, end = shown.text.split("…\n")
@@ -81,7 +81,7 @@ def test_the_framing_of_the_page_carries_every_message(tmp_path):
     file.write_text(text.replace("[unit]", '[unit]\nplugin = "unit.py"'), encoding="utf-8")
     (source,) = [block.text for block in blocks(PAGE, "python") if block.heading == PYTHON]
     (folder / "unit.py").write_text(source, encoding="utf-8")
-    result = CliRunner().invoke(build_app(), ["unit", "check", str(folder)])
+    result = CliRunner().invoke(build_app(["unit"]), ["unit", "check", str(folder)])
     assert result.exit_code == 0, result.output
     assert (
         "  > 01 03 0B C0 0B 01 10 01 02 03 04" in result.stdout

@@ -25,7 +25,7 @@ DIES = "import sys; print('ready can={}', flush=True); print('no more sky', file
 
 
 def run_command(*words: object):
-    return CliRunner().invoke(build_app(), list(map(str, words)))
+    return CliRunner().invoke(build_app(list(map(str, words))), list(map(str, words)))
 
 
 @pytest.mark.parametrize(

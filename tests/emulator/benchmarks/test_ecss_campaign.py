@@ -27,7 +27,7 @@ def campaign(folder, *settings: str, options: tuple = (), status: int = 0) -> di
     profile = folder / "a$_{`|<b>.toml"  # of which plots, tables and pages made markup
     profile.write_text(f'extends = "{PROFILE}"\n', encoding="utf-8")
     words = ["campaign", "--ecss", "--profile", str(profile), *OPTIONS, *options, *chosen, "-o", str(folder)]
-    result = CliRunner().invoke(build_app(), words)
+    result = CliRunner().invoke(build_app(words), words)
     assert result.exit_code == status, result.output
     return json.loads(result.stdout)
 

@@ -104,24 +104,24 @@ def test_foreign_files_are_neither_counted_nor_removed(folder: Path) -> None:
     (folder / "index-mine.bin").write_bytes(bytes(9_000_000))
     keep(1, 2, 3)
     assert kept(folder) == {1, 2, 3}
-    assert CliRunner().invoke(build_app(), ["cache", "clear"]).exit_code == 0
+    assert CliRunner().invoke(build_app(["cache"]), ["cache", "clear"]).exit_code == 0
     assert {path.name for path in folder.iterdir()} == {"notes.bin", "index-mine.bin"}
 
 
 def test_info_shows_files_size_and_limit(folder: Path) -> None:
     keep(1, 2)
     age(folder, n1=2000, n2=1000)
-    content = json.loads(CliRunner().invoke(build_app(), ["cache", "info", "--json"]).stdout)
+    content = json.loads(CliRunner().invoke(build_app(["cache"]), ["cache", "info", "--json"]).stdout)
     assert (content["folder"], content["limit_bytes"]) == (str(folder), 3_100_000)
     assert [item["name"] for item in content["files"]] == [f"{name(2)}.npz", f"{name(1)}.npz"]
     assert content["bytes"] == sum(path.stat().st_size for path in folder.iterdir())
-    shown = CliRunner().invoke(build_app(), ["cache"]).stdout
+    shown = CliRunner().invoke(build_app(["cache"]), ["cache"]).stdout
     assert "2.0 MB of 3.1 MB in 2 files" in shown
 
 
 def test_an_empty_cache_is_shown_and_cleared(folder: Path) -> None:
-    assert "0.0 MB of 3.1 MB in 0 files" in CliRunner().invoke(build_app(), ["cache", "info"]).stdout
-    assert "removed 0 of 0 files" in CliRunner().invoke(build_app(), ["cache", "clear"]).stdout
+    assert "0.0 MB of 3.1 MB in 0 files" in CliRunner().invoke(build_app(["cache"]), ["cache", "info"]).stdout
+    assert "removed 0 of 0 files" in CliRunner().invoke(build_app(["cache"]), ["cache", "clear"]).stdout
 
 
 def test_a_limit_that_is_not_a_number_is_reported_and_the_default_used(

@@ -613,7 +613,7 @@ def test_a_link_that_the_bench_lacks_is_rejected(device):
 
 
 def run_command(*words: str):
-    return CliRunner().invoke(build_app(), ["session", *map(str, words)])
+    return CliRunner().invoke(build_app(["session"]), ["session", *map(str, words)])
 
 
 def test_the_command_prints_steps_and_writes_logs_and_junit(device, tmp_path, hub):

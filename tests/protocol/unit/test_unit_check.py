@@ -91,7 +91,7 @@ def written(
 
 def unit_check(*words: object) -> tuple[int, str]:
     """Return exit status and output of `unit check`."""
-    result = CliRunner().invoke(build_app(), ["unit", "check", *map(str, words)])
+    result = CliRunner().invoke(build_app(["unit"]), ["unit", "check", *map(str, words)])
     assert result.exception is None or isinstance(result.exception, SystemExit)
     return result.exit_code, result.output
 

@@ -45,9 +45,13 @@ def photograph(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_photograph_is_identified_without_the_packages_of_the_bench_and_the_laboratory(
     photograph: Path,
 ) -> None:
+    words = ("identify", str(photograph), "--fov", "20", "--json")
+    run_command_line(
+        *words, program="starid"
+    )  # the first makes catalogues and indices, for which SciPy searches pairs
     program = "from starid.cli import main; main()"
     done = subprocess.run(
-        [sys.executable, "-X", "importtime", "-c", program, "identify", photograph, "--fov", "20", "--json"],
+        [sys.executable, "-X", "importtime", "-c", program, *words],
         capture_output=True, text=True, timeout=PATIENCE_S, check=True,
     )  # fmt: skip
     assert json.loads(done.stdout)["valid"]
