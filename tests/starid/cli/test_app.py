@@ -46,9 +46,8 @@ def test_a_photograph_is_identified_without_the_packages_of_the_bench_and_the_la
     photograph: Path,
 ) -> None:
     words = ("identify", str(photograph), "--fov", "20", "--json")
-    run_command_line(
-        *words, program="starid"
-    )  # the first makes catalogues and indices, for which SciPy searches pairs
+    # the first one makes catalogues and indices, for which SciPy searches pairs
+    run_command_line(*words, program="starid")
     program = "from starid.cli import main; main()"
     done = subprocess.run(
         [sys.executable, "-X", "importtime", "-c", program, *words],
