@@ -27,6 +27,8 @@ BIN := $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # without bytecode, each of the hundreds of processes that tests start compiles the package again
 unexport PYTHONDONTWRITEBYTECODE
+# tests have more cameras, catalogues and processors than a user: within the usual 500 MB, a run would remove what the next one needs
+export STARHIL_CACHE_LIMIT_MB ?= 2000
 
 # a target whose recipe failed is made again: the file .venv/pyvenv.cfg is written before pip is found to be missing
 .DELETE_ON_ERROR:
