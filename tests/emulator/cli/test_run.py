@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import signal
 import sys
 
 import pytest
 
 from starhil.emulator import cli
 from starhil.emulator.cli.run import _serve
+from starhil.emulator.cli.termination import ENDING
 
 
 @pytest.fixture(autouse=True)
-def collection():
-    """Let the other tests collect garbage as before."""
+def process_as_before():
+    """Let the other tests collect garbage, and get the signals that a run ignores at its end, as before."""
+    handlers = {number: signal.getsignal(number) for number in ENDING}
     yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
     gc.unfreeze()
     gc.enable()
 
