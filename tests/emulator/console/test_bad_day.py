@@ -144,7 +144,12 @@ def test_the_form_of_a_level_shows_its_faults_and_injecting_keeps_them(page):
     page.wait_for_function(
         "() => document.querySelector('[data-level=optical] [name=false_stars]').value === '5'"
     )
-    page.fill("[data-level=optical] [name=missing_stars]", "3")
+    page.locator("[data-level=optical] [name=missing_stars]").select_text()
+    fault(page, optical={"false_stars": 5, "missing_stars": 2})
+    page.wait_for_function(
+        "() => document.querySelector('[data-level=optical] [name=missing_stars]').value === '2'"
+    )
+    page.keyboard.insert_text("3")
     page.click("[data-level=optical] button[type=submit]")
     page.wait_for_function("() => document.querySelectorAll('#active-faults li').length === 2")
     active = page.evaluate("starhil.link.control({ do: 'status' })")["faults"]

@@ -13,6 +13,7 @@ import pytest
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, emulator_command, installed_command
 from tests.emulator.console.browser import (
     MARKS,
+    command,
     opened,
     still,
     track,
@@ -29,6 +30,10 @@ def own_page(browser, emulator):
     """A page that a test leaves or changes for good."""
     with opened(browser, emulator.ready["view"]) as page:
         yield page
+
+
+NOTE = "#telecommand-form [data-note=value]"
+"""What is said beside the value for a parameter."""
 
 
 def send(page, name, **values):
@@ -137,19 +142,30 @@ def test_a_wrong_parameter_shows_the_refusal(page):
 
 @still
 def test_the_present_value_of_a_parameter_is_shown_with_its_unit_and_follows_the_telecommand(page):
-    send(page, "set_parameter", parameter=1, value=200)
-    note = "#telecommand-form [data-note=value]"
-    wait_for_text(page, note, "now 200 ms\n1 … 5000")
-    send(page, "set_parameter", parameter=1, value=100)
-    wait_for_text(page, note, "now 100 ms\n1 … 5000")
-    assert page.evaluate(  # as another OBC would
-        "starhil.link.request({do: 'send', row: 'set_parameter', values: {parameter: 1, value: 150}})"
-    )["ok"]
-    wait_for_text(page, note, "now 150 ms\n1 … 5000")
+    for value in (200, 100):
+        assert send(page, "set_parameter", parameter=1, value=value).startswith("accepted in ")
+        wait_for_text(page, NOTE, f"now {value} ms\n1 … 5000")
+    command(page, "set_parameter", parameter=1, value=150)  # as another OBC would
+    wait_for_text(page, NOTE, "now 150 ms\n1 … 5000")
     page.select_option("#telecommand-form [name=parameter]", "13")
     page.wait_for_function(
-        "selector => document.querySelector(selector).textContent.includes(' px\\n')", arg=note
+        "selector => document.querySelector(selector).textContent.includes(' px\\n')", arg=NOTE
     )
+
+
+@still
+def test_a_value_about_to_be_replaced_is_replaced_although_the_parameter_changes_meanwhile(page):
+    command(page, "set_parameter", parameter=1, value=150)
+    page.click("[data-tab=telecommands]")
+    page.select_option("#telecommand", "set_parameter")
+    page.select_option("#telecommand-form [name=parameter]", "1")
+    wait_for_text(page, NOTE, "now 150 ms\n1 … 5000")
+    field = page.locator("#telecommand-form [name=value]")
+    field.select_text()
+    command(page, "set_parameter", parameter=1, value=100)
+    wait_for_text(page, NOTE, "now 100 ms\n1 … 5000")
+    page.keyboard.insert_text("200")
+    assert field.input_value() == "200"
 
 
 @still

@@ -1,7 +1,7 @@
 // Controls for all faults and scenarios, and the active faults. The form of a level shows what is active on it, and what is
 // injected is added to it.
 
-import { ask, make, number, say, setText, short } from "./format.js";
+import { ask, make, number, say, setText, setValue, short } from "./format.js";
 
 export class Faults {
   constructor(store, link, runs) {
@@ -52,7 +52,7 @@ export class Faults {
     const initial = control.default === null || control.default === undefined ? "" : String(control.default);
     let input;
     let read;
-    let write = (item) => (input.value = item === undefined ? initial : typeof item === "object" ? JSON.stringify(item) : String(item));
+    let write = (item) => setValue(input, item === undefined ? initial : typeof item === "object" ? JSON.stringify(item) : String(item));
     if (control.kind === "flag") {
       input = make("input", { type: "checkbox" });
       read = () => (input.checked ? true : undefined);

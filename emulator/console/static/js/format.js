@@ -97,6 +97,14 @@ export function setText(element, text) {
   if (element.textContent !== text) element.textContent = text;
 }
 
+// Show another value in a field. If all of the old text is selected, what is typed next still replaces it.
+export function setValue(field, value) {
+  if (field.value === value) return;
+  const selected = document.activeElement === field && field.selectionEnd - field.selectionStart === field.value.length;
+  field.value = value;
+  if (selected) field.select();
+}
+
 // Tell those who hear the page the outcome of what they did.
 export function say(text) {
   if (text) document.getElementById("said").textContent = text;

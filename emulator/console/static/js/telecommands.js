@@ -1,7 +1,7 @@
 // A form for each telecommand, with a preview of its bytes, and what was sent.
 
 import { address } from "./link.js";
-import { ask, limits, make, number, prose, say, setText, short, wall } from "./format.js";
+import { ask, limits, make, number, prose, say, setText, setValue, short, wall } from "./format.js";
 
 const KEPT_LINES = 200;
 
@@ -95,7 +95,7 @@ export class Telecommands {
     const { name, unit, min, max } = parameter;
     const field = this.form.elements.value;
     if (values && field && !field.dataset.edited && field.value !== String(values[name])) {
-      field.value = String(values[name]);
+      setValue(field, String(values[name]));
       this.preview();
     }
     const present = values ? [short(values[name]), unit].filter(Boolean).join(" ") : "–";
