@@ -26,7 +26,7 @@ from starhil.emulator.cli import app as starhil
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from starid.cli import app as starid
 from tests.emulator.cli.command_line import run_command_line
-from tests.process.conftest import NO_IMAGES_OPTIONS
+from tests.process.conftest import NO_IMAGES_OPTIONS, NO_IMAGES_TABLES
 from tests.test_docs import programs, run
 from tests.test_your_unit import written
 from tests.waiting import PATIENCE_S
@@ -40,8 +40,6 @@ _FENCED = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _INDENTED = re.compile(r"(?:^ {4}.*\n)+", re.MULTILINE)
 _INLINE = re.compile(r"`((?:starhil|starid) [^`]*)`")
 _OPERATORS = {"|", ";", "&", "&&", "||"}
-NO_IMAGES = '[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
-"""Tables of a profile whose emulator renders none: sessions with images are in tests/process."""
 _PLACEHOLDER = re.compile(r"[…\[|]|\b[A-Z]{2,}\b")
 
 
@@ -189,7 +187,7 @@ def folder(tmp_path, monkeypatch):
         'extends = "ideal"\n[parameters]\nstart_mode = "lost_in_space"\n'
     )
     for profile in ("cubestar", "ideal"):
-        (tmp_path / f"{profile}_quick.toml").write_text(f'extends = "{profile}"\n{NO_IMAGES}')
+        (tmp_path / f"{profile}_quick.toml").write_text(f'extends = "{profile}"\n{NO_IMAGES_TABLES}')
     (tmp_path / "lens.toml").write_text('extends = "ideal"\n')  # as `starid calibrate` writes it
     written(tmp_path / "lynx")
     assert run_command_line("unit", "new", "my_unit")[0] == 0
@@ -341,7 +339,7 @@ def test_the_way_from_an_icd_to_a_ci_job(shell, folder):
     assert set(commands) - set(job) == {"starhil unit check heron"}
     shutil.rmtree("heron")
     shell.type(new)
-    write_all(files | {"heron.toml": f"{files['heron.toml']}\n{NO_IMAGES}"}, folder)
+    write_all(files | {"heron.toml": f"{files['heron.toml']}\n{NO_IMAGES_TABLES}"}, folder)
     shell.type("starhil unit check heron")
     printed = [shell.type(line) for line in job]
     assert [line.split()[0] for line in job] == ["starhil", "mkdir", "starhil", "starhil", "pytest"]

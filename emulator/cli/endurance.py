@@ -39,8 +39,6 @@ LONG_STEPS: Final = 150
 SIGMA_ARCSEC: Final = {False: (10.0, 33.0), True: (60.0, 300.0)}
 """Largest standard deviations across and about the boresight of the error model, and of rendered images."""
 YEAR_S: Final = 365.25 * 86_400.0
-_LONGEST_WAIT_S: Final = 0.5
-"""Python does not end a wait for a signal that arrives as it begins, or in another thread."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +165,7 @@ def _run(plan: PlanOptions, folder: Path) -> Generator[dict[str, Any], None, Non
                     running.add(pool.submit(live_from_seed, *item, folder))
                 if not running:
                     return
-                ended, running = wait(running, _LONGEST_WAIT_S, FIRST_COMPLETED)
+                ended, running = wait(running, return_when=FIRST_COMPLETED)
                 done += len(ended)
                 if limit_s is None:
                     show(done, plan.lives)

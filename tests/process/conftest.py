@@ -14,6 +14,8 @@ from tests.waiting import PATIENCE_S
 FAST_BAUD = 921600
 NO_IMAGES = ("run.worker=error_model", "camera.distortion=[]")
 """Settings of an emulator whose images do not matter: it starts without numba, in a quarter of the processor time."""
+NO_IMAGES_TABLES = '[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
+"""The same as tables of a profile."""
 NO_IMAGES_OPTIONS = tuple(word for setting in NO_IMAGES for word in ("--set", setting))
 
 needs_vcan0 = pytest.mark.skipif(

@@ -25,6 +25,7 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.rig.emulator_process import emulator_command, installed_command
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.emulator_thread import EmulatorThread
+from tests.process.conftest import NO_IMAGES_TABLES
 from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
@@ -60,9 +61,7 @@ def fmu2(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def export(fmi: str, folder: Path) -> Path:
     profile = folder / QUICK
-    profile.write_text(
-        'extends = "ideal"\n[parameters]\nstart_mode = "lost_in_space"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
-    )
+    profile.write_text(f'extends = "ideal"\n[parameters]\nstart_mode = "lost_in_space"\n{NO_IMAGES_TABLES}')
     target = folder / f"fmi{fmi}.fmu"
     done = run_command_line("fmu", "export", str(profile), "--fmi", fmi, "-o", str(target))
     assert done == (0, "", "")

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.process.conftest import NO_IMAGES_TABLES
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.long
@@ -22,7 +23,7 @@ PACKAGES = {
     **{name: f"starhil/{name}" for name in ("emulator", "protocol", "hil_tests", "configs")},
 }
 """Where the files of each folder are in the wheel."""
-QUICK = 'extends = "cubestar"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
+QUICK = f'extends = "cubestar"\n{NO_IMAGES_TABLES}'
 """Profile without images: kernels of another installation would be compiled for a minute, as those of the first start."""
 OUR_ROOMS = ("emulator", "protocol", "hil_tests", "configs", "tools", "tests")
 

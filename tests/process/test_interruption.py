@@ -14,7 +14,7 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import EmulatorProcess, installed_command
 from starhil.hil_tests.rig.temporary_folder import temporary_folder
-from tests.process.conftest import NO_IMAGES_OPTIONS
+from tests.process.conftest import NO_IMAGES_OPTIONS, NO_IMAGES_TABLES
 from tests.waiting import PATIENCE_S, wait_until
 
 pytestmark = pytest.mark.process
@@ -89,7 +89,7 @@ def test_a_signal_leaves_no_process_and_no_folder_behind(name, number, tmp_path)
     )
     scratch.mkdir()
     script.write_text(SESSION, encoding="ascii")
-    quick.write_text("[run]\nworker = 'error_model'\n[camera]\ndistortion = []\n")
+    quick.write_text(NO_IMAGES_TABLES)
     words = {
         "session": ["session", script, "--log", tmp_path / "log"],
         "conformance": ["conformance", "serial.data", "serial.modes", "--html", html, "--verbose"],

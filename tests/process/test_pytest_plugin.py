@@ -14,7 +14,7 @@ import pytest
 
 from starhil.hil_tests.rig.emulator_process import emulator_command
 from tests.emulator.emulator_thread import EmulatorThread
-from tests.process.conftest import NO_IMAGES
+from tests.process.conftest import NO_IMAGES, NO_IMAGES_TABLES
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.process
@@ -25,10 +25,6 @@ README_TEST, _ = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_te
 COUNT = PAGE_TESTS.count("def test_")
 
 
-QUICK = 'extends = "{}"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
-"""Profile of the emulators, whose images do not matter."""
-
-
 WITHOUT = [f"-pno:{name}" for name in ("cacheprovider", "hypothesispytest", "xdist", "xdist.looponfail")]
 """Options that load no plugin of others, which takes half of a start."""
 
@@ -36,7 +32,8 @@ WITHOUT = [f"-pno:{name}" for name in ("cacheprovider", "hypothesispytest", "xdi
 def prepared(folder: Path, programs: str | dict[str, str], base: str = "ideal") -> list[str]:
     """Write programs of tests and a profile into a folder; return the words with which pytest runs them there."""
     files = programs if isinstance(programs, dict) else {"test_it.py": programs}
-    for name, program in {**files, "quick.toml": QUICK.format(base)}.items():
+    profile = f'extends = "{base}"\n{NO_IMAGES_TABLES}'
+    for name, program in {**files, "quick.toml": profile}.items():
         (folder / name).write_text(program)
     return [*WITHOUT, "-rs", "-v", "--starhil-profile=quick.toml", *files]
 

@@ -14,7 +14,7 @@ import pytest
 from tests.candump import read_candump
 from tests.emulator.cli.command_line import log_lines, run_command_line
 from tests.emulator.emulator_thread import EmulatorThread
-from tests.process.conftest import NO_IMAGES_OPTIONS
+from tests.process.conftest import NO_IMAGES_OPTIONS, NO_IMAGES_TABLES
 from tests.protocol.export.dissection import dissect
 
 pytestmark = pytest.mark.process
@@ -29,8 +29,7 @@ def profiles(tmp_path, monkeypatch):
     """The profiles without images, in the working directory."""
     monkeypatch.chdir(tmp_path)
     for name, base in ((QUICK, "cubestar"), (QUICK_IDEAL, "ideal")):
-        text = f'extends = "{base}"\n[run]\nworker = "error_model"\n[camera]\ndistortion = []\n'
-        Path(name).write_text(text)
+        Path(name).write_text(f'extends = "{base}"\n{NO_IMAGES_TABLES}')
 
 
 def starhil(*words: object) -> subprocess.CompletedProcess[str]:

@@ -6,6 +6,7 @@ import contextlib
 import io
 import signal
 import sys
+from collections.abc import Iterator
 from unittest import mock
 
 import pytest
@@ -15,13 +16,24 @@ from starhil.emulator.cli.termination import ENDING
 from starid.cli import app as starid
 
 
+@contextlib.contextmanager
+def signals_as_before() -> Iterator[None]:
+    """Let the tests that follow get the signals that a command which has served ignores until its process ends."""
+    handlers = {number: signal.getsignal(number) for number in ENDING}
+    try:
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
 def run_command_line(
     *arguments: str, encoding: str = "utf-8", program: str = "starhil"
 ) -> tuple[int, str, str]:
     """Run `starhil` or `starid`; return exit status, standard output and standard error."""
-    handlers = {number: signal.getsignal(number) for number in ENDING}
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding, write_through=True) for _ in range(2))
     with (
+        signals_as_before(),
         mock.patch.object(sys, "argv", [program, *arguments]),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
@@ -29,8 +41,6 @@ def run_command_line(
     ):
         {"starhil": starhil, "starid": starid}[program].main()
     assert isinstance(end.value.code, int)
-    for number, handler in handlers.items():  # a process of its own would end here, with signals ignored
-        signal.signal(number, handler)
     return end.value.code, _text(out), _text(err)
 
 

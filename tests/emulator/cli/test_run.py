@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import signal
 import sys
 
 import pytest
 
 from starhil.emulator import cli
 from starhil.emulator.cli.run import _serve
-from starhil.emulator.cli.termination import ENDING
+from tests.emulator.cli.command_line import signals_as_before
 
 
 @pytest.fixture(autouse=True)
 def process_as_before():
-    """Let the other tests collect garbage, and get the signals that a run ignores at its end, as before."""
-    handlers = {number: signal.getsignal(number) for number in ENDING}
-    yield
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
+    """Let the other tests collect garbage and get signals."""
+    with signals_as_before():
+        yield
     gc.unfreeze()
     gc.enable()
 
