@@ -202,7 +202,7 @@ def test_every_start_of_an_emulator_is_accepted(folder, monkeypatch):
         accepted.append(make)
         return 0
 
-    monkeypatch.setattr("starhil.emulator.cli.run._serve", serve)
+    monkeypatch.setattr("starhil.emulator.cli.run.serve", serve)
     monkeypatch.setattr("starhil.emulator.sensor.pipeline.worker_process.take_worker", lambda: None)
     blocks = [block for page in PAGES for block in typed(page)]
     starts = {

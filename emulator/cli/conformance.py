@@ -89,15 +89,15 @@ class CaseOptions:
         serial, can = links_to_use(bench.serial, bench.can, everything)
         if self.canopen is not None and can is None:
             raise BenchError("--canopen needs --can: give the channel of the node")
-        check_links(serial, can, "--serial DEV, --can CHANNEL, --canopen NODE", start=bench.start)
+        check_links(
+            serial, can, "--serial DEV, --can CHANNEL, --canopen NODE", start=bench.start or list_only
+        )
         settings = with_orbit(self.settings, self.orbit)
         if settings and not bench.start:
             option = "--set" if self.orbit is None else "--orbit"
             raise BenchError(f"{option} needs --start: it overrides a key of the emulator's profile")
         if self.truth is not None and bench.start:
             raise BenchError("--truth is for a unit that runs already; with --start the truth is known")
-        if not bench.start and not list_only and serial == "auto":
-            raise BenchError("--serial auto needs --start; otherwise name the port")
         return ConformanceRequest(
             unit=bench.unit,
             serial=serial,

@@ -328,10 +328,10 @@ def command(
             "off by degrees (starhil docs identification)",
             file=sys.stderr,
         )
-    return run_loop(_serve(lambda: Emulator(profiles, options, take_worker())))
+    return run_loop(serve(lambda: Emulator(profiles, options, take_worker())))
 
 
-async def _serve(make: Callable[[], Emulator]) -> int:
+async def serve(make: Callable[[], Emulator]) -> int:
     """Run an emulator, made in the event loop, until a signal or the control channel ends it; return the exit status."""
     import gc
 

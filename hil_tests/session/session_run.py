@@ -296,10 +296,8 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
     )
     serial, can = links_to_use(request.options.serial, request.options.can, by_default)
     check_links(serial, can, "--serial DEV, --can CHANNEL, both", start=request.start)
-    options = replace(request.options, serial=serial, can=can)
-    if not request.start and options.serial == "auto":
-        raise BenchError("--serial auto needs --start; otherwise name the port")
-    return replace(options, timeout_s=script.defaults.timeout_s, retries=script.defaults.retries)
+    timeout_s, retries = script.defaults.timeout_s, script.defaults.retries
+    return replace(request.options, serial=serial, can=can, timeout_s=timeout_s, retries=retries)
 
 
 def _emulator(

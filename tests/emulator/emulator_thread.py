@@ -55,7 +55,7 @@ def _maker(command: list[str]) -> Callable[[], Emulator]:
         return 0
 
     with (
-        mock.patch("starhil.emulator.cli.run._serve", lambda make: make),
+        mock.patch("starhil.emulator.cli.run.serve", lambda make: make),
         mock.patch("starhil.emulator.simulation.threads.run_loop", note),
     ):
         status, _, errors = run_command_line(*command[command.index("run") :])

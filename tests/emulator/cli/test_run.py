@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from starhil.emulator import cli
-from starhil.emulator.cli.run import _serve
+from starhil.emulator.cli.run import serve
 from tests.emulator.cli.command_line import signals_as_before
 
 
@@ -23,7 +23,7 @@ def process_as_before():
 
 
 class Started:
-    """What `_serve` calls of an emulator, ready at once and ended after its ready line."""
+    """What `serve` calls of an emulator, ready at once and ended after its ready line."""
 
     failed = False
 
@@ -53,6 +53,6 @@ def test_only_a_run_imports_without_collecting_garbage(monkeypatch, command, col
 
 def test_an_emulator_that_is_ready_collects_garbage_but_not_what_was_imported():
     gc.disable()
-    asyncio.run(_serve(Started))
+    asyncio.run(serve(Started))
     assert gc.isenabled()
     assert gc.get_freeze_count() > 0
