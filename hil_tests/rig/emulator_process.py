@@ -137,6 +137,7 @@ class EmulatorProcess:
         """Whether the process was ended by `stop` or `kill`, which have reported how."""
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._readers: list[threading.Thread] = []
+        """Threads that have started to read the process's output."""
 
     @property
     def unit(self) -> str:
@@ -172,12 +173,11 @@ class EmulatorProcess:
             raise EmulatorProcessError(f"{self.command[0]}: cannot be started: {error.strerror}") from None
         self._process, self._ended = process, False
         try:
-            self._readers = [
-                threading.Thread(target=self._read_output, args=(process.stdout,), daemon=True),
-                threading.Thread(target=self._read_errors, args=(process.stderr,), daemon=True),
-            ]
-            for reader in self._readers:
+            self._readers = []
+            for read, stream in ((self._read_output, process.stdout), (self._read_errors, process.stderr)):
+                reader = threading.Thread(target=read, args=(stream,), daemon=True)
                 reader.start()
+                self._readers.append(reader)
             self.ready = self._wait_for_ready()
         except (
             BaseException

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
@@ -146,6 +147,24 @@ def test_an_emulator_ends_while_a_file_is_read_that_the_control_channel_named(tm
         peer.connect(str(control))
         peer.sendall(b'{"do": "set_truth", "truth": {"kind": "file", "path": "/"}}\n')
         wait_until(reading.exists)
+
+
+@pytest.mark.parametrize("started", [0, 1])
+def test_a_start_that_is_interrupted_before_all_output_is_read_ends_the_emulator(started, monkeypatch):
+    readers, start = [], threading.Thread.start
+
+    def start_or_interrupt(thread):
+        if len(readers) == started:
+            raise KeyboardInterrupt
+        readers.append(thread)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", start_or_interrupt)
+    process = EmulatorProcess([sys.executable, "-c", "import time; time.sleep(600)"])
+    with pytest.raises(KeyboardInterrupt), process:
+        pass
+    assert not process.running
+    assert not any(each.is_alive() for each in readers)
 
 
 def test_an_interrupted_start_ends_the_emulator():
