@@ -42,13 +42,15 @@ def links_to_use(
 
 
 def check_links(serial: str | None, can: str | None, options: str, *, start: bool) -> None:
-    """Raise an error if no link is in use, naming the `options` that give one, or one is `auto` although no emulator is started."""
+    """Raise an error if no link is in use, naming the `options` that give one unless an emulator is started.
+
+    The CAN channel `auto` is a bus whether or not one is started; the serial port `auto` is that of the one that is.
+    """
     if serial is None and can is None:
         remedy = "the emulator needs --serial auto or --can auto" if start else f"use {options}, or --start"
         raise BenchError(f"no link: {remedy}")
-    for option, link, named in (("--serial", serial, "port"), ("--can", can, "channel")):
-        if link == "auto" and not start:
-            raise BenchError(f"{option} auto needs --start; otherwise name the {named}")
+    if serial == "auto" and not start:
+        raise BenchError("--serial auto needs --start; otherwise name the port")
 
 
 @dataclass(frozen=True)

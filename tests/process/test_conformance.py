@@ -138,7 +138,6 @@ def test_the_attitude_of_a_running_unit_is_compared_with_its_truth_log_or_a_stat
         (["nothing.such", "--serial", "/dev/null"], "no conformance case matches 'nothing.such'"),
         (["--serial", "/dev/no-such-tty"], "/dev/no-such-tty"),
         (["--serial", "auto"], "--serial auto needs --start; otherwise name the port"),
-        (["--can", "auto"], "--can auto needs --start; otherwise name the channel"),
         (["--canopen", "5"], "--canopen needs --can"),
         (["--start", "--truth", "1,2,3"], "--truth is for a unit that runs already"),
         (["--serial", "/dev/null", "--truth", "no.csv"], "no.csv: the truth cannot be read"),

@@ -678,7 +678,6 @@ def test_listening_where_no_row_comes_without_a_request_is_rejected_before_the_f
             "no link: the emulator needs --serial auto or --can auto",
         ),
         (["first_light", "--serial", "auto"], "--serial auto needs --start; otherwise name the port"),
-        (["first_light", "--can", "auto"], "--can auto needs --start; otherwise name the channel"),
         (["first_light", "--serial", "/dev/ttyS77", "--dialect", "d"], "must be a, b or c"),
     ],
 )
