@@ -12,6 +12,7 @@ from starhil.emulator.run.faults import FaultRequest
 from starhil.emulator.simulation.config_model import Strict
 from starhil.emulator.truth.config import FixedConfig, RateConfig
 from starhil.hil_tests.endurance.life import Life
+from starhil.hil_tests.judge.links import LinkName
 from starhil.protocol.files.user_file import read_user_text
 from starhil.protocol.files.validation import problems
 
@@ -19,7 +20,6 @@ LONGEST_WAIT_S: Final = 1e6
 MOST_REQUESTS: Final = 100_000
 MOST_EVENTS: Final = 1_000_000
 
-Link = Literal["serial", "can", "canopen"]
 Hex = Annotated[str, Field(pattern=r"^([0-9a-fA-F]{2})*$")]
 Row = tuple[str, Annotated[int, Field(ge=0, lt=2**32)], Literal["telemetry", "telecommand"]]
 """Class, ID and kind."""
@@ -35,20 +35,20 @@ class _Wait(Strict):
 
 class _Request(Strict):
     do: Literal["request"]
-    link: Link
+    link: LinkName
     row: Row
     data: Hex = ""
 
 
 class _Burst(Strict):
     do: Literal["burst"]
-    link: Link
+    link: LinkName
     rows: list[Row]
 
 
 class _Flood(Strict):
     do: Literal["flood"]
-    link: Link
+    link: LinkName
     row: Row
     data: Hex = ""
     count: Annotated[int, Field(ge=1, le=MOST_REQUESTS)]
@@ -56,20 +56,20 @@ class _Flood(Strict):
 
 class _Cut(Strict):
     do: Literal["cut"]
-    link: Link
+    link: LinkName
     row: Row
     share: Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class _Nmt(Strict):
     do: Literal["nmt"]
-    link: Link
+    link: LinkName
     command: Annotated[int, Field(ge=0, le=255)]
 
 
 class _Junk(Strict):
     do: Literal["junk"]
-    link: Link
+    link: LinkName
     data: Hex = ""
     frames: list[OtherFrame] = Field(default_factory=list)
 
@@ -105,7 +105,7 @@ class _Disk(Strict):
 
 class _Peer(Strict):
     do: Literal["peer"]
-    link: Link
+    link: LinkName
     reads: bool
 
 
@@ -147,7 +147,7 @@ class _Profile(Strict):
 class _LifeFile(Strict):
     unit: str
     seed: Annotated[int, Field(ge=0)]
-    links: Annotated[list[Link], Field(min_length=1)]
+    links: Annotated[list[LinkName], Field(min_length=1)]
     profile: _Profile
     steps: list[_AnyStep]
     rendered: bool = False

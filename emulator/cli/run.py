@@ -306,9 +306,7 @@ def command(
         )
     names = head or [profile or DEFAULT_PROFILE]
     profiles = with_own_seeds([device.profile(name, number) for number, name in enumerate(names, start=1)])
-    reachable = any(
-        kind.setting(each.links) not in ("off", 0) for each in profiles for kind in LINKS.values()
-    )
+    reachable = any(kind.requested(each.links) for each in profiles for kind in LINKS.values())
     observed = around.truth_log or around.record or (around.control, around.view) != ("off", "off")
     if not reachable and not observed:
         raise EmulatorError(

@@ -102,13 +102,15 @@ class MemoryWiring(Wiring):
 
     repeatable = True
 
-    def __init__(self, port: MemorySerial, buses: Mapping[str, MemoryTransport[CanFrame]]) -> None:
+    def __init__(
+        self, lines: Mapping[str, MemorySerial], buses: Mapping[str, MemoryTransport[CanFrame]]
+    ) -> None:
         super().__init__(SteppedClock())
-        self._port = port
+        self._lines = lines
         self._buses = buses
 
     def serial(self, name: str, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (no port is opened)
-        return self._port
+        return self._lines[name]
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002 (no bus is opened)
         return self._buses[name]
@@ -153,13 +155,11 @@ class UnitUnderTest:
             "worker": "process" if rendered else "error_model",
             "state_dir": str(folder.resolve() / STATE_FOLDER),
         }
-        channels: dict[str, Any] = {
-            "serial": {"port": "auto" if "serial" in links else "off"},
-            "can": {"channel": "auto" if "can" in links or icd.canopen_only else "off"},
-            "canopen": {
-                "node": int(icd.device_parameters["canopen_node"].default) if "canopen" in links else 0
-            },
-        }
+        channels: dict[str, dict[str, str | int]] = {}
+        for name, kind in LINKS.items():
+            section, key = kind.key.split(".")
+            with_bus = name in links or (name == "can" and icd.canopen_only)
+            channels[section] = {key: kind.usual(icd) if with_bus else kind.off}
         table = {**profile, "unit": unit, "run": run, "links": channels}
         try:
             self.profile = Profile.model_validate(table)
@@ -199,19 +199,21 @@ class UnitUnderTest:
         """Switch the unit on and wait until the emulator is ready; simulation time begins at zero."""
         reads = {name: transport.reads for name, transport in self._transports.items()}
         self._emulator = None
-        port = MemorySerial("serial", self._time_s)
+        lines = {
+            name: MemorySerial(name, self._time_s) for name, kind in LINKS.items() if kind.carries is bytes
+        }
         buses: dict[str, MemoryTransport[CanFrame]] = {
             name: MemoryTransport(f"virtual:{name}", self._time_s)
             for name, kind in LINKS.items()
             if kind.carries is CanFrame
         }
-        self._transports = {"serial": port, **buses}
+        self._transports = {**lines, **buses}
         for name, transport in self._transports.items():
             transport.reads = reads.get(name, True)
         if self._record is not None:
             shutil.rmtree(self._record, ignore_errors=True)
         options = RunOptions(record=self._record)
-        self._emulator = Emulator([self.profile], options, wiring=MemoryWiring(port, buses))
+        self._emulator = Emulator([self.profile], options, wiring=MemoryWiring(lines, buses))
         await self._emulator.start()
         self.head.device.signals.frame_published.connect(self._count_frame)
         await self._emulator.ready()

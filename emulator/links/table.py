@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Final, Literal, Protocol, TypeAlias
+from typing import Any, ClassVar, Final, Literal, Protocol, TypeAlias
 
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.errors import EmulatorError
@@ -104,6 +104,8 @@ class LinkKind(ABC):
     carries: ClassVar[type[bytes | CanFrame]]
     key: ClassVar[str]
     """Key of `[links]` that opens the link."""
+    off: ClassVar[str | int] = "off"
+    """Value of the key without the link."""
     address: ClassVar[str] = ""
     """Parameter with the address on the bus; empty for a point-to-point line."""
     role: ClassVar[str] = ""
@@ -113,12 +115,20 @@ class LinkKind(ABC):
     def is_of(self, icd: InterfaceDefinition) -> bool:
         """Return whether a unit has the link."""
 
-    @abstractmethod
-    def setting(self, links: LinksConfig) -> str | int:
-        """Return the value of `key`; `off` or 0 if the link is not requested."""
+    def usual(self, icd: InterfaceDefinition) -> str | int:  # noqa: ARG002 (for others)
+        """Return the value of the key with which a unit has the link where it is usually looked for."""
+        return "auto"
+
+    def setting(self, links: LinksConfig) -> Any:
+        """Return the value of the key."""
+        section, key = self.key.split(".")
+        return getattr(getattr(links, section), key)
+
+    def requested(self, links: LinksConfig) -> bool:
+        return bool(self.setting(links) != self.off)
 
     def opens(self, links: LinksConfig, icd: InterfaceDefinition) -> bool:
-        return self.setting(links) not in ("off", 0) and self.is_of(icd)
+        return self.requested(links) and self.is_of(icd)
 
     @abstractmethod
     def exclusive(self, links: LinksConfig) -> tuple[str, str, int]:
@@ -138,9 +148,6 @@ class _Serial(LinkKind):
 
     def is_of(self, icd: InterfaceDefinition) -> bool:
         return icd.link.serial is not None
-
-    def setting(self, links: LinksConfig) -> str:
-        return links.serial.port
 
     def exclusive(self, links: LinksConfig) -> tuple[str, str, int]:
         port = links.serial.port
@@ -177,9 +184,6 @@ class _Can(LinkKind):
     def is_of(self, icd: InterfaceDefinition) -> bool:
         return icd.link.can is not None
 
-    def setting(self, links: LinksConfig) -> str:
-        return links.can.channel
-
     def exclusive(self, links: LinksConfig) -> tuple[str, str, int]:
         return "links.can.address", "" if links.can.channel == "off" else links.can.channel, links.can.address
 
@@ -190,16 +194,17 @@ class _Can(LinkKind):
 
 class _Canopen(LinkKind):
     bus, title, carries, key = "can", "CANopen", CanFrame, "canopen.node"
+    off = 0
     address, role = "canopen_node", "node"
 
     def is_of(self, icd: InterfaceDefinition) -> bool:
         return icd.canopen is not None
 
-    def setting(self, links: LinksConfig) -> int:
-        return links.canopen.node
+    def usual(self, icd: InterfaceDefinition) -> int:
+        return int(icd.device_parameters[self.address].default)
 
     def opens(self, links: LinksConfig, icd: InterfaceDefinition) -> bool:
-        return bool(links.canopen.node) or (icd.canopen_only and links.can.channel != "off")
+        return self.requested(links) or (icd.canopen_only and links.can.channel != "off")
 
     def exclusive(self, links: LinksConfig) -> tuple[str, str, int]:
         return "links.canopen.node", links.can.channel if links.canopen.node else "", links.canopen.node
@@ -226,7 +231,7 @@ def check_links(profile: Profile, icd: InterfaceDefinition) -> None:
     for kind in LINKS.values():
         if problem := kind.problem(links, icd):
             raise EmulatorError(problem)
-    requested = [kind for kind in LINKS.values() if kind.setting(links) not in ("off", 0)]
+    requested = [kind for kind in LINKS.values() if kind.requested(links)]
     lacking = [kind for kind in requested if kind.bus not in buses]
     if requested and lacking == requested:
         raise EmulatorError(f"links.{requested[0].key}: unit {icd.name} has none of the links requested")

@@ -22,6 +22,7 @@ from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, Requ
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.serial.framings import Deframer
 from starhil.protocol.serial.stack import HostReceiver, SerialStack
+from starhil.protocol.transports.paced import SerialTransport
 
 SHOWN_VALUES: Final = 8
 
@@ -57,7 +58,7 @@ class WireItem:
 class Traffic:
     """Reports each item on the links of a head, with the signal `passed`.
 
-    On a bus with two links, both receive the same frames, which are reported once.
+    On a CAN bus with two links, both receive the same frames, which are reported once.
     """
 
     def __init__(self) -> None:
@@ -68,7 +69,7 @@ class Traffic:
         """Report the items of a link, under the name of its bus or another one."""
         bus = bus or link.bus
         link.wire.listener = partial(self._report, bus, True)  # noqa: FBT003 (outgoing)
-        if bus not in self._buses:
+        if bus not in self._buses or isinstance(link.transport, SerialTransport):
             self._buses.add(bus)
             link.transport.listener = partial(self._report, bus, False)  # noqa: FBT003 (incoming)
 

@@ -49,7 +49,7 @@ from starhil.emulator.truth.config import (
 from starhil.protocol.errors import MAX_PROBLEMS, IcdError, ProtocolError, remedy
 from starhil.protocol.files.bundled import DEFAULT_UNIT, bundled, bundled_units, find, not_found
 from starhil.protocol.files.user_file import TomlError, parse_toml
-from starhil.protocol.files.validation import TableOf, problems
+from starhil.protocol.files.validation import Problem, TableOf, problems
 from starhil.protocol.unit import load_unit
 from starid.errors import StaridError
 from starid.identification.options import ALGORITHMS
@@ -222,13 +222,14 @@ PATHS: Final = profile_paths(Profile)
 _LONGEST_SHOWN: Final = 200
 """Longest part of a `--set` that an error repeats before it says what is wrong with it, characters."""
 
-_FAULT_HINT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
-FAULT_KEY_HINTS: Final = dict.fromkeys(
-    ("fault", "faults", "optical", "telemetry", "serial", "can", "stuck", "error", "reset", "upset", "clock", "phase", "drop", "corrupt",
-     "junk", "delay_s", "split", "gap_s"),
+_FAULT_HINT: Final = "; a fault belongs in a scenario (--scenario) or on the control channel"
+FAULT_HINTS: Final = dict.fromkeys(
+    ("fault", "faults", "optical", "clock", "phase", "telemetry", "serial", "can"),
     _FAULT_HINT,
-)  # fmt: skip
-"""Keys of faults, which a profile does not have, and the hint for whoever writes one there."""
+)
+"""Tables of faults, which a profile does not have, and the hint for whoever writes one there."""
+TABLES_WITH_FAULTS: Final = ("device", "links")
+"""Tables of a profile in which somebody may write the key of a fault."""
 ATTITUDE_KEY_HINTS: Final = {
     key: f"; did you mean attitude.{key}?" for key in ("ra_deg", "dec_deg", "roll_deg", "quaternion_xyzw")
 }
@@ -268,10 +269,8 @@ def _overridden(path: Path, values: dict[str, Any], layers: list[Layer], overrid
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
-        listed = problems(
-            error, Profile, values, also=("extends",), hints=FAULT_KEY_HINTS | ATTITUDE_KEY_HINTS
-        )
-        faults += [(problem.location, str(problem)) for problem in listed]
+        listed = problems(error, Profile, values, also=("extends",), hints=FAULT_HINTS | ATTITUDE_KEY_HINTS)
+        faults += [(problem.location, f"{problem}{_hint_for_fault(problem)}") for problem in listed]
     name = str(values.get("unit", DEFAULT_UNIT))
     unit = _path_of_unit(name, path.parent)
     if unit is None:
@@ -283,6 +282,12 @@ def _overridden(path: Path, values: dict[str, Any], layers: list[Layer], overrid
         named = ((_source_of(layers, location) or f"profile {path}", text) for location, text in faults)
         raise EmulatorError(*(f"{source}: {text}" for source, text in named))
     return profile.read_from(path, layers)
+
+
+def _hint_for_fault(problem: Problem) -> str:
+    """Return the hint for a key that may be that of a fault: one like no other key of its table."""
+    may_be = problem.unknown and problem.location[0] in TABLES_WITH_FAULTS and "; known: " in problem.text
+    return _FAULT_HINT if may_be else ""
 
 
 def _problems_of_identifier(values: Mapping[str, Any]) -> Iterator[tuple[Sequence[object], str]]:

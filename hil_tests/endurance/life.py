@@ -416,7 +416,7 @@ class LifeGenerator:
     def _junk(self) -> Step:
         link = self._random.choice(self._links)
         count = self._random.randint(1, 6)
-        if link == "serial":
+        if LINKS[link].bus == "serial":
             return {"do": "junk", "link": link, "data": self._random.randbytes(count * 3).hex()}
         frames = [
             [self._random.getrandbits(29), self._random.randbytes(self._random.randint(0, 8)).hex()]

@@ -64,13 +64,11 @@ class Obc:
 
     def _port(self, link: str, address: Value) -> Port:
         deliver, take = partial(self._unit.deliver, link), partial(self._unit.take, link)
-        match link:
-            case "serial":
-                return SerialPort(self._definition, deliver, take, str(address))
-            case "can":
-                return CanPort(deliver, take, int(address))
-            case _:
-                return CanopenPort(self._definition, self._objects, deliver, take, int(address))
+        if LINKS[link].bus == "serial":
+            return SerialPort(self._definition, deliver, take, str(address))
+        if link == "canopen":
+            return CanopenPort(self._definition, self._objects, deliver, take, int(address))
+        return CanPort(deliver, take, int(address))
 
     async def pass_time(self, seconds: float, *, most: int | None = None) -> None:
         """Let time pass, and judge the messages that arrive in it."""
@@ -273,7 +271,7 @@ class Obc:
     def _expected_answers(self, link: str, row: Row | None) -> Sequence[str]:
         if row is None:
             return ("reply",)
-        return tuple(self._definition.serial_answers(row) if link == "serial" else row.answers)
+        return tuple(self._definition.serial_answers(row) if LINKS[link].bus == "serial" else row.answers)
 
     def _is_code(self, code: int, error: str, port: Port) -> bool:
         """Return whether a refusal has the code of an error; aborts have codes of their own, some lines have none."""
@@ -345,7 +343,7 @@ class Obc:
             return
         content = b"" if row_definition.is_telemetry else bytes(row_definition.size)
         self._ports[link].cut(self._definition.request(row_definition, content), share)
-        if link != "serial":
+        if LINKS[link].bus != "serial":
             await self.pass_time(TIME_OUT_S)
             return
         if self._fixed_framing:  # any bytes are a request

@@ -11,6 +11,7 @@ from starhil.hil_tests.endurance.life import Life, Step
 from starhil.hil_tests.endurance.ports import HOST
 from starhil.hil_tests.judge import can
 from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.links import LINKS
 from starhil.hil_tests.judge.messages import Request
 from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can.frame import CanFrame
@@ -75,7 +76,7 @@ def session_of(life: Life, definition: Unit, violation: str) -> str:
                 request = Request(
                     row_id, bytes.fromhex(step.get("data", "")), message_class, kind == "telemetry"
                 )
-                if step["link"] == "serial":
+                if LINKS[step["link"]].bus == "serial":
                     sent = [SerialLine(definition).encode(request).hex(" ")]
                 else:
                     sent = [str(CanFrame(*frame)) for frame in can.frames_of(request, HOST, 4)]

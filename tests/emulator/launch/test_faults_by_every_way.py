@@ -92,7 +92,7 @@ EXAMPLES: Final[dict[str, dict[str, dict[str, Any]]]] = {
 """What is injected for a key, with the other keys that it needs; the others are made from their range."""
 
 WITHOUT_EFFECT: Final = {("can", "split"), ("can", "gap_s")}
-"""Keys that a CAN frame, which cannot be split, ignores."""
+"""Keys without effect on what is sent and read here: a CAN frame cannot be split."""
 
 OTHER_UNIT: Final = {("telemetry", "wrong_check"): "sagitta"}
 """Keys that need what `cubestar` has not, and a unit that has it."""

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from starhil.emulator.launch.unit_in_memory import MemorySerial
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS, MAX_ADDRESSES, Decoder, Traffic, WireItem, short
 from starhil.protocol.can.cubespace import encode_reply_frames
 from starhil.protocol.can.frame import CanFrame
@@ -80,6 +81,19 @@ def test_segments_for_more_addresses_than_are_joined_are_forgotten():
         assert whole.data == data
     found = [event for frame in others for event in decoder.events(sent(frame))]
     assert data not in [getattr(event, "data", b"") for event in found]
+
+
+def test_each_of_two_serial_lines_reports_what_arrives():
+    lines = [
+        SimpleNamespace(bus="serial", wire=SimpleNamespace(), transport=MemorySerial(name, lambda: 0.0))
+        for name in ("one", "two")
+    ]
+    traffic, passed = Traffic(), []
+    traffic.passed.connect(passed.append)
+    for line in lines:
+        traffic.add(line)
+        line.transport.listener(line.transport.description.encode())
+    assert [entry.item for entry in passed] == [b"one", b"two"]
 
 
 def test_a_bus_with_two_links_reports_what_arrives_once_and_nothing_without_an_observer():

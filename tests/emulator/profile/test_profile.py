@@ -10,11 +10,13 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.profile.pipeline_setup import pipeline_setup
-from starhil.emulator.profile.profile import CALIBRATION, FAULT_KEY_HINTS
+from starhil.emulator.profile.profile import CALIBRATION, FAULT_HINTS
+from starhil.emulator.profile.sections import CanConfig, DeviceConfig
 from starhil.emulator.run.faults import DeviceFault, FaultRequest
 from starhil.emulator.sensor.pipeline.star_identifiers import StarIdentifierSetup
 from starhil.emulator.sensor.sky.view import Sky
 from starhil.emulator.truth.config import SlewConfig
+from starhil.protocol.errors import listed
 from starhil.protocol.files.bundled import bundled
 from starid.camera import Camera
 from starid.catalog import load_catalog
@@ -236,7 +238,8 @@ def test_all_errors_of_a_profile_are_listed_each_with_its_source_key_and_remedy(
         load_profile(
             path, ["run.clok=x", "parameters.exposure=0", "parameters.update_rat=5", "links.can.drop=1"]
         )
-    fault = "unknown key; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
+    fault = "a fault belongs in a scenario (--scenario) or on the control channel"
+    of_device = listed(sorted(DeviceConfig.model_fields))
     assert sorted(caught.value.args) == sorted(
         [
             f"profile {base}: run.sede: unknown key; did you mean seed?",
@@ -247,13 +250,13 @@ def test_all_errors_of_a_profile_are_listed_each_with_its_source_key_and_remedy(
             f"profile {path}: sensor.read_nois: unknown key; did you mean read_noise_e, dead_pixels?",
             f"profile {path}: sensor.bits: must be one of 8, 12, 16 (given: 9)",
             f"profile {path}: identifier.foo: not an option of the algorithm geometric; known: blend_px, cache, fov_tolerance",
-            f"profile {path}: optical: {fault}",
-            f"profile {path}: device.stuck: {fault}",
+            f"profile {path}: optical: unknown key; {fault}",
+            f"profile {path}: device.stuck: unknown key; known: {of_device}; {fault}",
             f"profile {path}: health.t: must be a number (given: 'x')",
             "--set run.clok=x: run.clok: unknown key; did you mean clock?",
             "--set parameters.exposure=0: parameters.exposure: 0 is outside 1 to 5000 ms",
             "--set parameters.update_rat=5: parameters.update_rat: unknown key; did you mean update_rate, max_rate?",
-            f"--set links.can.drop=1: links.can.drop: {fault}",
+            f"--set links.can.drop=1: links.can.drop: unknown key; known: {listed(sorted(CanConfig.model_fields))}; {fault}",
             f"profile {base}: parameters.k11: unknown key; did you mean k1?",
         ]
     )
@@ -276,9 +279,13 @@ def test_what_follows_from_the_device_is_no_option_of_the_algorithm(option, key)
 
 
 def test_the_hint_for_faults_is_given_for_every_key_of_a_fault_and_no_key_of_a_profile():
-    levels = FaultRequest.model_fields.keys()
-    keys = {*levels, *DeviceFault.model_fields, *WireFault.model_fields}
-    assert keys - {"device"} == FAULT_KEY_HINTS.keys() - {"fault", "faults"}
+    assert {*FaultRequest.model_fields, "fault", "faults"} == {*FAULT_HINTS, "device"}
+    keys = [f"device.{key}" for key in DeviceFault.model_fields]
+    keys += [f"links.{bus}.{key}" for key in WireFault.model_fields for bus in ("serial", "can")]
+    for key in {*keys} - {"links.can.gap_s"}:  # like frame_gap_s, which is named instead
+        assert refusal("ideal", [f"{key}=1"]).endswith(
+            "a fault belongs in a scenario (--scenario) or on the control channel"
+        )
 
 
 def test_a_profile_that_extends_itself_is_rejected(tmp_path):
