@@ -49,7 +49,7 @@ from starhil.protocol.transports.serial import open_serial
 from starhil.protocol.unit import load_unit
 
 if TYPE_CHECKING:
-    from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
+    from canopen import ObjectDictionary
 
 
 POINTING: Final = from_radec_roll(90.0, -30.0, 45.0)
@@ -183,6 +183,8 @@ def run_conformance(
         with ExitStack() as stack:
             ports: Mapping[str, str | None] = {"serial": request.serial, "can": request.can}
             truth = None if request.truth is None else truth_source(request.truth)
+            links = {item.id.partition(".")[0] for item in cases}
+            eds = _read_eds(request) if "canopen" in links else None
             emulator = _start_emulator(request, stack) if request.start else None
             if emulator is not None:
                 ports = emulator.ready
@@ -197,8 +199,7 @@ def run_conformance(
                     RunFeed(address, kind="conformance", title="Conformance", unit=where, planned=planned)
                 )
                 listeners.append(partial(_send_to_console, feed))
-            links = {item.id.partition(".")[0] for item in cases}
-            for probe, port in _probes(request, unit, links, ports, stack):
+            for probe, port in _probes(request, unit, links, ports, eds, stack):
                 probe.truth = truth
                 facts[f"device on {probe.link}"] = identity_of(probe)
                 mine = [item for item in cases if item.id.startswith(f"{probe.link}.")]
@@ -258,6 +259,7 @@ def _probes(
     unit: Unit,
     links: set[str],
     ports: Mapping[str, str | None],
+    eds: tuple[ObjectDictionary, str] | None,
     stack: ExitStack,
 ) -> Iterator[tuple[Probe, str]]:
     """Open the links one after the other; yield the probe of each, and the name of its port."""
@@ -280,8 +282,15 @@ def _probes(
         settings = settings_of(unit)
         probe = CanProbe(bus, unit, host=host, device=device, times=request.times, settings=settings)
         yield probe, f"{can} at address {device}"
-    if "canopen" in links and can is not None:
-        yield _canopen_probe(request, unit, can, stack), f"{can} at node {request.canopen_node}"
+    if eds is not None and can is not None:
+        from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
+        from starhil.hil_tests.judge.canopen import entries
+
+        bus, node = (
+            stack.enter_context(LivePort(open_can(can), request.speed)),
+            int(request.canopen_node or 0),
+        )
+        yield CanopenProbe(bus, node, *eds, entries(unit, unit.canopen)), f"{can} at node {node}"
 
 
 def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
@@ -312,28 +321,23 @@ def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorPr
     return emulator
 
 
-def _canopen_probe(request: ConformanceRequest, unit: Unit, can: str, stack: ExitStack) -> CanopenProbe:
-    """Open a CANopen node with the requested EDS, or else the product's."""
+def _read_eds(request: ConformanceRequest) -> tuple[ObjectDictionary, str]:
+    """Return dictionary and text of the requested EDS, or else of the product's."""
     import canopen
     from canopen.objectdictionary import import_od
 
-    from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
-    from starhil.hil_tests.judge.canopen import entries
-
-    node = int(request.canopen_node or 0)
     text = _eds_text(request)
     with temporary_folder("starhil-eds-") as folder:
         path = folder / "unit.eds"
         path.write_text(text, encoding="utf-8")
         try:
-            dictionary = import_od(str(path), node)
+            dictionary = import_od(str(path), int(request.canopen_node or 0))
         except (canopen.ObjectDictionaryError, configparser.Error, *WRONG_VALUES) as error:
             why = str(error).replace(str(path), str(request.eds))
             raise BenchError(f"{request.eds}: not a valid EDS: {why}") from None
     if DEVICE_TYPE not in dictionary:
         raise BenchError(f"{request.eds}: not a valid EDS: lacks object 1000h, which every node has")
-    bus = stack.enter_context(LivePort(open_can(can), request.speed))
-    return CanopenProbe(bus, node, dictionary, text, entries(unit, unit.canopen))
+    return dictionary, text
 
 
 def _eds_text(request: ConformanceRequest) -> str:
