@@ -45,7 +45,7 @@ GROUPS = {
         "tests/emulator/units",
         "tests/emulator/control/test_upsets.py",
     ],
-    "emulator/links": ["tests/emulator/links"],
+    "emulator/links": ["tests/emulator/links", "tests/emulator/profile", "tests/emulator/run"],
     "protocol/canopen": ["tests/protocol/canopen", "tests/emulator/links/test_canopen.py"],
     **dict.fromkeys(("protocol/serial", "protocol/can", "protocol/icd"), _WIRE),
 }

@@ -5,10 +5,18 @@ from types import SimpleNamespace
 import pytest
 
 from starhil.emulator.launch.unit_in_memory import MemorySerial
-from starhil.emulator.links.traffic import CONSOLE_ADDRESS, MAX_ADDRESSES, Decoder, Traffic, WireItem, short
-from starhil.protocol.can.cubespace import encode_reply_frames
+from starhil.emulator.links.traffic import (
+    CONSOLE_ADDRESS,
+    MAX_ADDRESSES,
+    Decoder,
+    Traffic,
+    WireItem,
+    canopen_text,
+    short,
+)
+from starhil.protocol.can.cubespace import encode_reply_frames, encode_request_frames
 from starhil.protocol.can.frame import CanFrame
-from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial.cubespace import Dialect
 from starhil.protocol.unit import load_unit
 from tests.protocol.serial.composed_links import CUBESPACE
@@ -81,6 +89,81 @@ def test_segments_for_more_addresses_than_are_joined_are_forgotten():
         assert whole.data == data
     found = [event for frame in others for event in decoder.events(sent(frame))]
     assert data not in [getattr(event, "data", b"") for event in found]
+
+
+def lines(items, dialect=Dialect.B):
+    decoder = Decoder(ICD, lambda: dialect)
+    return [
+        (line["kind"], line["text"])
+        for line in (
+            decoder.line(
+                WireItem(0.01 * number, "can" if isinstance(item, CanFrame) else "serial", outgoing, item)
+            )
+            for number, (outgoing, item) in enumerate(items)
+        )
+    ]
+
+
+@pytest.mark.parametrize("dialect", list(Dialect))
+def test_serial_requests_and_replies_are_named_in_every_dialect(dialect):
+    data = STATUS.encode(STATUS.example(), saturate=True)
+    request, command = Request.of(STATUS.id), Request.of(MODE.id, MODE.encode({"mode": "standby"}))
+    trace = lines(
+        [
+            (False, CUBESPACE.encode_request(request)),
+            (True, CUBESPACE.encode_reply(Reply(ReplyKind.TELEMETRY, STATUS.id, data), dialect)),
+            (False, CUBESPACE.encode_request(command)[:3]),
+            (False, CUBESPACE.encode_request(command)[3:]),
+            (True, CUBESPACE.encode_reply(Reply(ReplyKind.NACK, MODE.id, code=ErrorCode.SEQUENCE), dialect)),
+        ],
+        dialect,
+    )
+    assert trace[0] == ("telemetry", "device_status?")
+    assert trace[1][0] == "reply"
+    assert trace[1][1].startswith("device_status mode=boot error=none")
+    assert trace[2] == ("part", "part of a message")
+    assert trace[3] == ("telecommand", "set_mode mode=standby")
+    assert trace[4] == ("nack", "set_mode refused: sequence")
+
+
+def test_segments_on_can_are_joined_for_each_pair_of_nodes():
+    data = STATUS.encode(STATUS.example(), saturate=True)
+    reply = Reply(ReplyKind.TELEMETRY, STATUS.id, data, destination=1)
+    other = Reply(ReplyKind.TELEMETRY, STATUS.id, data, destination=253)
+    segments = zip(encode_reply_frames(reply, 4), encode_reply_frames(other, 4), strict=True)
+    found = lines([(True, frame) for pair in segments for frame in pair])
+    assert all(text.endswith("segment of device_status") for _, text in found[:-2])
+    assert found[-2][1].startswith("4→1 device_status mode=boot")
+    assert found[-1][1].startswith("4→253 device_status mode=boot")
+
+
+def test_requests_on_can_and_junk_are_distinguished():
+    (frame,) = encode_request_frames(Request.of(STATUS.id), 1, 4)
+    trace = lines(
+        [(False, frame), (False, CanFrame(0x1FFFFFFF, b"\x01")), (True, CanFrame(0x05EE0401, bytes(3)))]
+    )
+    assert trace[0] == ("telemetry", "1→4 device_status?")
+    assert trace[1][0] == "fault"
+    assert trace[2] == ("reply", "4→1 id 238")
+
+
+@pytest.mark.parametrize(
+    ("can_id", "text"),
+    [
+        (0x000, "NMT command"), (0x080, "SYNC"), (0x0AC, "node 44 EMCY"), (0x1AC, "node 44 TPDO 1"),
+        (0x5AC, "node 44 SDO reply"), (0x62C, "node 44 SDO request"), (0x72C, "node 44 heartbeat"), (0x7E5, "LSS request"),
+        (0x101, "COB-ID 101"),
+    ],
+)  # fmt: skip
+def test_frames_of_canopen_are_named_by_their_function(can_id, text):
+    assert canopen_text(CanFrame(can_id, extended=False)) == text
+
+
+def test_traffic_of_the_line_of_the_console_is_marked_as_its_own():
+    found = Decoder(ICD, lambda: Dialect.B).line(
+        WireItem(0.0, "console", outgoing=False, item=CUBESPACE.encode_request(Request.of(STATUS.id)))
+    )
+    assert (found["own"], found["text"]) == (True, "device_status?")
 
 
 def test_each_of_two_serial_lines_reports_what_arrives():
