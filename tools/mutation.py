@@ -47,7 +47,8 @@ GROUPS = {
     ],
     "emulator/links": ["tests/emulator/links", "tests/emulator/profile", "tests/emulator/run"],
     "protocol/canopen": ["tests/protocol/canopen", "tests/emulator/links/test_canopen.py"],
-    **dict.fromkeys(("protocol/serial", "protocol/can", "protocol/icd"), _WIRE),
+    "protocol/can": ["tests/protocol/can", "tests/protocol/transports", "tests/emulator/links"],
+    **dict.fromkeys(("protocol/serial", "protocol/icd"), _WIRE),
 }
 """Folders of modules, and the tests among which those of a line are found."""
 PYTEST = [

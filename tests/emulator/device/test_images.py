@@ -31,10 +31,13 @@ def download(bench, edge, size_name):
 
 @pytest.mark.parametrize("edge", [64, 128, 256])
 def test_an_image_is_captured_in_standby_and_downloaded_by_frames(bench, edge):
+    at_s = bench.clock.now_ns() / 1e9
     save(bench, f"size_{edge}")
     image = download(bench, edge, f"size_{edge}")
     assert (image == np.arange(edge, dtype=np.uint8)[np.newaxis] % 251).all()
-    assert not bench.pipeline.frames[-1].solve
+    exposed = bench.pipeline.frames[-1]
+    assert not exposed.solve
+    assert exposed.begin_s == pytest.approx(at_s, abs=1e-6)
     assert bench.read("device_status")["image_stored"]
 
 

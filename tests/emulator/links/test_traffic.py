@@ -151,6 +151,8 @@ def test_requests_on_can_and_junk_are_distinguished():
     ("can_id", "text"),
     [
         (0x000, "NMT command"), (0x080, "SYNC"), (0x0AC, "node 44 EMCY"), (0x1AC, "node 44 TPDO 1"),
+        (0x22C, "node 44 RPDO 1"), (0x2AC, "node 44 TPDO 2"), (0x32C, "node 44 RPDO 2"), (0x3AC, "node 44 TPDO 3"),
+        (0x42C, "node 44 RPDO 3"), (0x4AC, "node 44 TPDO 4"), (0x52C, "node 44 RPDO 4"), (0x7E4, "LSS reply"),
         (0x5AC, "node 44 SDO reply"), (0x62C, "node 44 SDO request"), (0x72C, "node 44 heartbeat"), (0x7E5, "LSS request"),
         (0x101, "COB-ID 101"),
     ],

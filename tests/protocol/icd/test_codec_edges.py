@@ -55,6 +55,14 @@ doc = "d"
 provenance = "ours"
 action = "nothing"
 fields = [{ name = "angle", type = "f32", scale = 0.5, offset = 10, min = -10, max = 30 }]
+
+[[telecommand]]
+id = 4
+name = "walk"
+doc = "d"
+provenance = "ours"
+action = "nothing"
+fields = [{ name = "step", type = "i16", scale = 2.5, offset = 1 }]
 """
 
 
@@ -102,6 +110,13 @@ def test_a_double_without_limits_may_exceed_single_precision(icd):
 def test_a_scaled_number_is_the_nearest_decimal_number(icd, raw):
     row = icd.telecommands["set"]
     assert row.named_fields["centi"].to_physical(raw) == raw / 100
+
+
+@pytest.mark.parametrize(("raw", "step"), [(0, 1.0), (3, 8.5), (-32768, -81919.0)])
+def test_a_whole_number_is_multiplied_by_its_scale_and_moved_by_its_offset(icd, raw, step):
+    row = icd.telecommands["walk"]
+    assert row.encode({"step": step}) == struct.pack("<h", raw)
+    assert row.decode(struct.pack("<h", raw)) == {"step": step}
 
 
 def test_an_enumeration_and_a_flag_limit_their_parameters():
