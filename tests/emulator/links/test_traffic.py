@@ -58,6 +58,12 @@ def test_what_passes_is_named_as_far_as_the_unit_has_such_a_link(name):
     assert not line["own"]
 
 
+def test_a_row_is_found_by_its_name():
+    decoder = Decoder(ICD, lambda: None)
+    assert decoder.row_named("device_status") is STATUS
+    assert decoder.row_named("nothing") is None
+
+
 def test_a_reply_without_an_id_is_that_to_the_last_request():
     decoder = Decoder(ICD, lambda: Dialect.B)
     request_bytes = CUBESPACE.encode_request(Request(RequestKind.TELEMETRY, STATUS.id))
