@@ -199,6 +199,7 @@ def test_a_restarted_message_is_accepted() -> None:
     receiver = CanDeviceReceiver(DEVICE)
     events = take(receiver, _segments()[:2] + _segments())
     assert isinstance(events[0], LinkFault)
+    assert events[0].detail.endswith(f", expected {_segments()[2].data[-1]}")
     assert events[1:] == [WHOLE]
 
 
@@ -222,11 +223,15 @@ def test_a_message_longer_than_allowed_is_one_fault() -> None:
 
 def test_too_many_open_messages_evict_the_oldest() -> None:
     receiver = CanDeviceReceiver(DEVICE)
+    senders = range(MAX_OPEN_MESSAGES + 5)
+    frames = [encode_request_frames(Request.of(54, bytes(20)), source, DEVICE) for source in senders]
     events: list[object] = []
-    for source in range(MAX_OPEN_MESSAGES + 5):
-        start = encode_request_frames(Request.of(54, bytes(20)), source, DEVICE)[:1]
-        events += take(receiver, start, now=source * 1e-4)
+    for source in senders:
+        events += take(receiver, frames[source][:1], now=source * 1e-4)
     assert [event.kind for event in events if isinstance(event, LinkFault)] == [FaultKind.CAN_OVERLONG] * 5
+    ends = [take(receiver, frames[source][1:], now=0.01) for source in senders]
+    whole = [[type(event) for event in end] == [Request] for end in ends]
+    assert whole == [source >= 5 for source in senders]
 
 
 @pytest.mark.parametrize(
