@@ -224,7 +224,7 @@ def test_a_message_longer_than_allowed_is_one_fault() -> None:
 def test_too_many_open_messages_evict_the_oldest() -> None:
     receiver = CanDeviceReceiver(DEVICE)
     senders = range(MAX_OPEN_MESSAGES + 5)
-    frames = [encode_request_frames(Request.of(54, bytes(20)), source, DEVICE) for source in senders]
+    frames = [encode_request_frames(Request.of(54, bytes(12)), source, DEVICE) for source in senders]
     events: list[object] = []
     for source in senders:
         events += take(receiver, frames[source][:1], now=source * 1e-4)
