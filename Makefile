@@ -1,6 +1,6 @@
 # make demo        set up and run the product end to end; results in out/demo
 # make test        set up and run all tests (those on a real vcan0 in a guest); the last lines say what ran, and why tests were skipped
-# make check       for whoever edits, two minutes: ruff, contracts of imports, and tests without processes and long computations
+# make check       for whoever edits, a minute or two: ruff, contracts of imports, and tests without processes and long computations
 # make lowest      the tests marked `lowest` with the lowest versions of dependencies that pyproject.toml admits
 # make versions    the same tests with the newest dependencies on VERSIONS of Python, on the Debians that have them (as root, on Debian)
 # make arm64       the same bytes as here on an emulated arm64, and on the processor of an older server (as root, on Debian; an hour)
