@@ -286,10 +286,8 @@ def _probes(
         from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
         from starhil.hil_tests.judge.canopen import entries
 
-        bus, node = (
-            stack.enter_context(LivePort(open_can(can), request.speed)),
-            int(request.canopen_node or 0),
-        )
+        node = int(request.canopen_node or 0)
+        bus = stack.enter_context(LivePort(open_can(can), request.speed))
         yield CanopenProbe(bus, node, *eds, entries(unit, unit.canopen)), f"{can} at node {node}"
 
 
