@@ -175,15 +175,15 @@ def test_traffic_of_the_line_of_the_console_is_marked_as_its_own():
 
 
 def test_each_of_two_serial_lines_reports_what_arrives():
-    lines = [
+    links = [
         SimpleNamespace(bus="serial", wire=SimpleNamespace(), transport=MemorySerial(name, lambda: 0.0))
         for name in ("one", "two")
     ]
     traffic, passed = Traffic(), []
     traffic.passed.connect(passed.append)
-    for line in lines:
-        traffic.add(line)
-        line.transport.listener(line.transport.description.encode())
+    for link in links:
+        traffic.add(link)
+        link.transport.listener(link.transport.description.encode())
     assert [entry.item for entry in passed] == [b"one", b"two"]
 
 
