@@ -56,8 +56,10 @@ FRAMES = {
     (0x32C, "01"): ("canopen", "node 44 RPDO 2"),  # maps nothing
     (0x1AC, "0102010F0201"): (
         "canopen",
-        "node 44 TPDO 1 mode=standby error=parameter_store reset_cause=power_on "
-        "time_set parameters_changed attitude_valid image_stored store_fault=15 boot_count=258",
+        (
+            "node 44 TPDO 1 mode=standby error=parameter_store reset_cause=power_on "
+            "time_set parameters_changed attitude_valid image_stored store_fault=15 boot_count=258"
+        ),
     ),
     (0x2AC, "0102"): ("canopen", "node 44 TPDO 2 sequence=1 flags=2"),  # the rest is missing
     (0x3AC, "01"): ("canopen", "node 44 TPDO 3 sequence=1"),
